@@ -1,0 +1,76 @@
+"""The world under the drivers: serial links, cameras, pins and the date.
+
+Drivers get everything they touch from a `Hardware`. `RealHardware` opens devices; the simulator's `SimHardware`
+(robotd.sim.hardware) speaks the same bytes and renders the same pixels, and nothing above this module can tell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Protocol
+
+from .records import Frame
+
+
+class SerialLink(Protocol):
+    """An open serial line, 8N1. Every method raises DriverFault when the device is gone."""
+
+    async def read(self) -> tuple[float, bytes]:
+        """Wait for bytes; returns (loop time at which the last of them arrived, at least one byte)."""
+
+    def write(self, data: bytes) -> None:
+        """Queue bytes for sending; never blocks."""
+
+    def set_baud(self, baud: int) -> None:
+        """Change the speed of both directions."""
+
+    def pulse_wake(self, seconds: float) -> None:
+        """Hold the wake line (BRC) low for so long, in the background; a link without that line ignores it."""
+
+    def close(self) -> None:
+        """Send what is queued, then release the device; safe to call twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraMode:
+    """What a camera is asked for: size in pixels (width, height), frames per second, exposure in seconds."""
+
+    size: tuple[int, int] = (640, 480)
+    fps: float = 30.0
+    exposure: float = 0.010
+
+
+class CameraSource(Protocol):
+    """An open, running camera. Every method raises DriverFault when the device is gone."""
+
+    mode: CameraMode  # as negotiated, which may differ from what was asked for
+
+    async def read(self) -> Frame:
+        """Wait for the next frame; when nobody reads, the oldest waiting ones are dropped."""
+
+    def close(self) -> None:
+        """Stop streaming and release the device; safe to call twice."""
+
+
+class Hardware(Protocol):
+    """Where drivers get their devices from."""
+
+    @property
+    def pins(self) -> Any:
+        """A gpiozero pin factory, or None for gpiozero's default."""
+
+    async def open_serial(self, port: str, baud: int) -> SerialLink:
+        """Open a serial port exclusively; raises DriverFault with the reason and the mend."""
+
+    async def open_camera(self, device: str, name: str, mode: CameraMode) -> CameraSource:
+        """Open a camera and start it; `name` goes into its frames. Raises DriverFault with the reason and the mend."""
+
+    def utc(self) -> datetime:
+        """The date, time-zone aware: the only source of dates in the daemon."""
+
+    def boot_id(self) -> str:
+        """Names this start of the computer: loop times of different boots cannot be compared."""
+
+    def is_synchronised(self) -> bool:
+        """Whether `utc` is known to be right (a Pi has no clock of its own)."""
