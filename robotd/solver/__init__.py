@@ -1,0 +1,6 @@
+"""The solver: a survey in, a map out. Runs off the robot."""
+
+from .evaluate import Evaluation, evaluate
+from .mapping import solve
+
+__all__ = ["Evaluation", "evaluate", "solve"]

@@ -1,0 +1,72 @@
+"""How sure the solution is: covariances from the whole normal matrix, poses, rig and odometry factors included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..records import Floats
+from .bundle import SQUARE, Adjustment
+from .problem import State
+
+_MOST_ENTRIES = 20_000_000  # of one dense temporary array: 160 MB
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariance:
+    """`points` (l, 3, 3) for the adjustment's labels, `stops` (S, 3, 3) of x, y, heading, and `leverage` (N,).
+
+    The leverage h of a sighting is the trace of its prediction's covariance in units of its variance: its expected
+    squared residual is 2 - h, so that one with leverage 2 is not checked by any other.
+    """
+
+    points: Floats
+    stops: Floats
+    leverage: Floats
+
+
+def covariance(adjustment: Adjustment, state: State) -> Covariance:
+    """Covariances at the least-squares optimum, from the inverse of the normal matrix."""
+    problem = adjustment.problem
+    linear = adjustment.linearise(state, SQUARE)
+    S, V_inverse, WV = adjustment.eliminate(adjustment.normal(linear, state, SQUARE))
+    n, labels = adjustment.size, len(V_inverse)
+    frame = _inverse(S)
+    points = np.empty((labels, 3, 3))
+    coupled = np.empty((len(adjustment.sightings), 15, 3))
+    # held-fixed entries get a zero row and column by way of one extra index
+    padded = np.zeros((n + 1, n + 1))
+    padded[:n, :n] = frame
+    columns = np.where(adjustment.columns < 0, n, adjustment.columns)
+    mine = columns[adjustment.entries]
+    at_once = max(1, _MOST_ENTRIES // max(3 * n, 1))
+    for low in range(0, labels, at_once):
+        some = slice(low, min(low + at_once, labels))
+        block = WV[:, 3 * some.start : 3 * some.stop].toarray()
+        cross = np.zeros((n + 1, some.stop - some.start, 3))
+        cross[:n] = (frame @ block).reshape(n, -1, 3)
+        points[some] = V_inverse[some] + np.einsum("nli,nlj->lij", block.reshape(n, -1, 3), cross[:n])
+        here = np.flatnonzero((adjustment.point >= some.start) & (adjustment.point < some.stop))
+        coupled[here] = -cross[mine[here], adjustment.point[here, None] - some.start]
+    stops = np.zeros((problem.stop_count, 3, 3))
+    for f in range(problem.stop_count):
+        entries = columns[5 * f : 5 * f + 3]
+        stops[f] = padded[np.ix_(entries, entries)]
+    A, B = linear.by_frame, linear.by_point
+    leverage = (
+        np.einsum("nri,nij,nrj->n", A, padded[mine[:, :, None], mine[:, None, :]], A, optimize=True)
+        + 2.0 * np.einsum("nri,nij,nrj->n", A, coupled, B, optimize=True)
+        + np.einsum("nri,nij,nrj->n", B, points[adjustment.point], B, optimize=True)
+    )
+    return Covariance(0.5 * (points + points.transpose(0, 2, 1)), stops, np.clip(leverage, 0.0, 2.0))
+
+
+def _inverse(S: Floats) -> Floats:
+    """Inverse of a symmetric matrix; what rounding has made singular or negative counts as barely known."""
+    if len(S) == 0:
+        return S
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S), 1e-12))
+    values, vectors = np.linalg.eigh(S * scale[:, None] * scale)
+    root = vectors * (scale[:, None] / np.sqrt(np.maximum(values, 1e-13)))
+    return np.asarray(root @ root.T)

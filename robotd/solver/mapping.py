@@ -1,0 +1,196 @@
+"""A survey in, a map out: positions with covariance, and for every label without one the reason in words."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from ..geometry.transforms import wrap_angle
+from ..records import (
+    Candidate,
+    Floats,
+    Map,
+    MappedLabel,
+    MappedSighting,
+    MappedStop,
+    Matrix3,
+    SolverRun,
+    Survey,
+    Vector3,
+)
+from .bundle import SQUARE, Adjustment
+from .linear import solve_linear
+from .problem import Bools, Problem, build_problem
+from .robust import OUTLIER, Optimum, optimise
+
+WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
+_TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
+_TRUSTED_STOPS = 4  # agreement from as many is no chance, however many other sightings disagree
+_UNKNOWN = np.diag([1e6, 1e6, np.pi**2])  # covariance of a stop that nothing ties to the world
+
+
+def solve(survey: Survey, method: Literal["bundle", "linear"] = "bundle") -> Map:
+    """Make the map of a survey.
+
+    Parameters
+    ----------
+    survey : Survey
+    method : {"bundle", "linear"}
+        Robust bundle adjustment of everything, or the thesis's linear triangulation from odometry as a baseline.
+
+    Returns
+    -------
+    Map
+        Every label of the survey is in it, with a position or with the reason why it has none.
+
+    Raises
+    ------
+    InputError
+        If the survey contradicts itself; lists every mistake.
+    SolverError
+        If there is nothing to solve.
+    """
+    problem = build_problem(survey)
+    if method == "linear":
+        return solve_linear(problem)
+    if method != "bundle":
+        raise ValueError(f"method must be bundle or linear, got {method!r}")
+    return _to_map(problem, optimise(problem))
+
+
+def _to_map(asked: Problem, optimum: Optimum) -> Map:
+    problem, state = optimum.problem, optimum.state
+    everything = Adjustment(problem, problem.sightings)
+    linear = everything.linearise(state, SQUARE)
+    square = (linear.residual**2).sum(axis=1)
+    counts = Counter(s.label for stop in problem.survey.stops for s in stop.sightings)
+    labels = tuple(_label(asked, optimum, i, counts[label]) for i, label in enumerate(problem.labels))
+    located = {m.label for m in labels if m.status in ("placed", "known")}
+    residual_px = linear.residual * problem.sightings.sigma[:, None]
+    inlier = optimum.inlier
+    used = residual_px[inlier]
+    notes = [*problem.notes]
+    lost = [f"{s.leg}/{s.stop}" for s, ok in zip(problem.survey.stops, optimum.placed, strict=True) if not ok]
+    if lost:
+        notes.append(
+            f"leg/stop {', '.join(lost)} share too few labels with the rest to be joined to it; their poses are in "
+            "their own odometry frame; map some of the same labels from both"
+        )
+    if len(problem.sightings) == 0:
+        notes.append("the survey has no usable sightings, so no label has a position")
+    cost = 0.5 * (square[inlier].sum() + (linear.move**2).sum() + (linear.roof**2).sum())
+    return Map(
+        survey=problem.survey.survey,
+        frame=problem.frame,
+        labels=labels,
+        stops=_stops(optimum),
+        sightings=_sightings(problem, residual_px, linear.valid, inlier.astype(np.float64), located),
+        cost=float(cost),
+        rms_px=float(np.sqrt(np.mean(used**2))) if len(used) else 0.0,
+        solver=SolverRun(optimum.iterations, optimum.converged, "bundle"),
+        notes=tuple(notes),
+    )
+
+
+def _label(asked: Problem, optimum: Optimum, i: int, count: int) -> MappedLabel:
+    problem, label = optimum.problem, asked.labels[i]
+    mine = problem.sightings.label == i
+    all_stops = set(asked.sightings.stop[asked.sightings.label == i].tolist())
+    inliers = int(np.count_nonzero(mine & optimum.inlier))
+    position, covariance = _vector(optimum.state.points[i]), None
+    at = int(np.searchsorted(optimum.adjustment.labels, i))
+    adjusted = at < len(optimum.adjustment.labels) and optimum.adjustment.labels[at] == i
+    if adjusted:
+        covariance = optimum.covariance.points[at]
+
+    def unplaced(reason: str) -> MappedLabel:
+        return MappedLabel(label, "unplaced", None, None, count, inliers, reason)
+
+    known = np.flatnonzero(problem.known.label == i)
+    if len(known):
+        k = int(known[0])
+        if covariance is None:
+            position, covariance = _vector(problem.known.position[k]), problem.known.sigma[k] ** 2 * np.eye(3)
+        return MappedLabel(label, "known", position, _matrix(covariance), count, inliers)
+    if count == 0:
+        return unplaced("its measured position was rejected and no camera saw it; measure it again")
+    if not all_stops:
+        return unplaced("every sighting lies beyond the lens model's valid radius; map it from another stop")
+    if len(all_stops) == 1:
+        return unplaced("seen from one stop only; map it from a second stop")
+    if not mine.any() or len(set(problem.sightings.stop[mine].tolist())) < 2:
+        return unplaced("seen only from stops that could not be joined to the map; map it together with mapped labels")
+    lead = optimum.gain[i] - optimum.rival_gain[i]
+    if np.isfinite(optimum.rival_points[i, 0]) and lead < _TIE and optimum.rival_gain[i] > _TIE * optimum.gain[i]:
+        return _ambiguous(optimum, i, label, count, inliers)
+    if covariance is None:
+        return unplaced(
+            f"its {count} sightings do not meet in one point (reflections or wrong identities); flash it again, alone"
+        )
+    agreeing = len(set(problem.sightings.stop[mine & optimum.inlier].tolist()))
+    doubt = problem.sightings.probability[mine & ~optimum.inlier & ~optimum.in_floor].sum()
+    if agreeing < _TRUSTED_STOPS and doubt >= problem.sightings.probability[mine & optimum.inlier].sum():
+        return unplaced(f"only {inliers} of its {count} sightings agree, which may be chance; flash it again, alone")
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    if not sigma <= WIDEST_SIGMA_M:
+        return unplaced(f"views nearly parallel (standard deviation {sigma:.2g} m); map it from a stop further aside")
+    return MappedLabel(label, "placed", position, _matrix(covariance), count, inliers)
+
+
+def _ambiguous(optimum: Optimum, i: int, label: str, count: int, inliers: int) -> MappedLabel:
+    problem, state = optimum.problem, optimum.state
+    mine = Adjustment(problem, problem.sightings.select(problem.sightings.label == i))
+    candidates = []
+    for point in (state.points[i], optimum.rival_points[i]):
+        points = state.points.copy()
+        points[i] = point
+        linear = mine.linearise(replace(state, points=points), SQUARE)
+        # a sighting of the other candidate counts as an outlier, so that the costs can be compared
+        cost = 0.5 * np.minimum((linear.residual**2).sum(axis=1), OUTLIER).sum()
+        candidates.append(Candidate(_vector(point), float(cost)))
+    candidates.sort(key=lambda c: c.cost)
+    distance = float(np.linalg.norm(np.subtract(candidates[0].position, candidates[1].position)))
+    reason = (
+        f"two positions {distance:.1f} m apart explain its sightings equally well (mirror solutions tied); "
+        "map it from another stop"
+    )
+    return MappedLabel(label, "ambiguous", None, None, count, inliers, reason, tuple(candidates))
+
+
+def _stops(optimum: Optimum) -> tuple[MappedStop, ...]:
+    poses = optimum.problem.stop_entries(optimum.state)
+    covariances = np.where(optimum.placed[:, None, None], optimum.covariance.stops, _UNKNOWN)
+    return tuple(
+        MappedStop(stop.leg, stop.stop, float(x), float(y), wrap_angle(float(heading)), _matrix(covariance))
+        for stop, (x, y, heading), covariance in zip(
+            optimum.problem.survey.stops, poses[:, :3], covariances, strict=True
+        )
+    )
+
+
+def _sightings(
+    problem: Problem, residual_px: Floats, valid: Bools, weight: Floats, located: set[str]
+) -> tuple[MappedSighting, ...]:
+    row_of = {int(source): row for row, source in enumerate(problem.sightings.source)}
+    result = []
+    everything = ((stop, s) for stop in problem.survey.stops for s in stop.sightings)
+    for number, (stop, s) in enumerate(everything):
+        row = row_of.get(number)
+        shown = row is not None and s.label in located and bool(valid[row])
+        residual = (float(residual_px[row, 0]), float(residual_px[row, 1])) if shown else None
+        share = float(weight[row]) if row is not None else 0.0
+        result.append(MappedSighting(stop.leg, stop.stop, s.camera, s.label, residual, share))
+    return tuple(result)
+
+
+def _vector(values: Floats) -> Vector3:
+    x, y, z = values.tolist()
+    return (x, y, z)
+
+
+def _matrix(values: Floats) -> Matrix3:
+    a, b, c = values
+    return (_vector(a), _vector(b), _vector(c))

@@ -1,0 +1,343 @@
+"""A survey as arrays: what is unknown, what was measured, and how far each may be believed.
+
+The unknowns are a frame vector and the label points. The frame vector holds, in this order,
+
+    5 per stop      x, y, heading, roll, pitch
+    10 per camera   corrections: rotation vector (3) and translation (3) in camera-to-robot, fx, fy, cx, cy
+    2               relative errors of all odometry: scale (dx, dy) and turn (dheading)
+
+Entries whose prior is zero, and the first stop's planar pose when nothing outside fixes the world frame, are held
+fixed: they have no column in the normal equations, so that a planar problem costs what a planar problem costs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, SolverError
+from ..geometry.camera import Camera
+from ..geometry.transforms import pose_array, se2_relative
+from ..records import Floats, Survey
+
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+STOP, CAMERA, ODOMETRY = 5, 10, 2  # entries of the frame vector per stop, per camera, and for all odometry
+SIGMA_FLOOR_PX = 0.05  # because no lens calibration is better than this, whatever a detector says of its centroid
+BEACON_SPREAD_M = 0.05  # beacons nearer together than this do not show a heading
+COVARIANCE_FLOOR = np.diag([1e-4, 1e-4, 1e-4]) ** 2  # keeps a move that was reported as exact invertible
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """The usable sightings as arrays, ordered by camera; `source` is the index in the survey's own order.
+
+    `stop`, `camera`, `label` and `source` are (N,) indices, `uv` (N, 2) px, `sigma` (N,) px, `probability` (N,).
+    `rival` (N,) numbers the groups of sightings of one label by one camera at one stop: at most one of each is right.
+    `origin`, `direction` (N, 3) are the viewing rays in robot axes under the calibration as given.
+    """
+
+    stop: Ints
+    camera: Ints
+    label: Ints
+    uv: Floats
+    sigma: Floats
+    probability: Floats
+    rival: Ints
+    source: Ints
+    origin: Floats
+    direction: Floats
+
+    def __len__(self) -> int:
+        return len(self.stop)
+
+    def select(self, keep: Bools | Ints) -> Sightings:
+        """Some of the sightings."""
+        return Sightings(*(getattr(self, name)[keep] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moves:
+    """Odometry factors: `before`, `after` (M,) stops, `measured` (M, 3), `covariance` (M, 3, 3)."""
+
+    before: Ints
+    after: Ints
+    measured: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Roofs:
+    """Beacons seen by roof cameras: `stop` (B,), `beacon` (B, 3) in robot axes, `uv` (B, 2) and `sigma` (B,) in px.
+
+    `H_image_world` (B, 3, 3) takes world x, y in the beacons' plane to the roof camera's pixels.
+    """
+
+    stop: Ints
+    beacon: Floats
+    uv: Floats
+    sigma: Floats
+    H_image_world: Floats
+
+    def select(self, keep: Bools) -> Roofs:
+        """Some of the beacon sightings."""
+        return Roofs(*(getattr(self, name)[keep] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """Labels measured by hand: `label` (K,) indices, `position` (K, 3) and `sigma` (K,) in metres."""
+
+    label: Ints
+    position: Floats
+    sigma: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Values of all unknowns: `frame` (F,) as the module describes, `points` (L, 3) world metres."""
+
+    frame: Floats
+    points: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Everything the solver computes with; indices count stops in the survey's order and labels as in `labels`.
+
+    `prior_sigma` (F,) holds the standard deviations of the frame entries around zero: 0 = held fixed, infinite = free.
+    `leg` (S,) is the leg of each stop, `odometry` (S, 3) its dead-reckoned pose in the leg's own frame.
+    `frame` says what fixes the world frame: "first stop", "known labels" or "roof cameras".
+    """
+
+    survey: Survey
+    cameras: tuple[Camera, ...]
+    R_robot_camera: Floats
+    t_robot_camera: Floats
+    labels: tuple[str, ...]
+    sightings: Sightings
+    moves: Moves
+    roofs: Roofs
+    known: Known
+    leg: Ints
+    odometry: Floats
+    prior_sigma: Floats
+    frame: str
+    notes: tuple[str, ...]
+
+    @property
+    def stop_count(self) -> int:
+        return len(self.leg)
+
+    @property
+    def free(self) -> Bools:
+        """(F,) entries of the frame vector that the solver may change."""
+        return np.asarray(self.prior_sigma > 0.0)
+
+    def stop_entries(self, state: State) -> Floats:
+        """(S, 5) x, y, heading, roll, pitch."""
+        return state.frame[: STOP * self.stop_count].reshape(-1, STOP)
+
+    def camera_entries(self, state: State) -> Floats:
+        """(C, 10) corrections of the cameras."""
+        return state.frame[STOP * self.stop_count : -ODOMETRY].reshape(-1, CAMERA)
+
+
+def build_problem(survey: Survey) -> Problem:
+    """Turn a survey into arrays.
+
+    Raises
+    ------
+    InputError
+        If the survey contradicts itself (unknown camera, a stop twice, numbers that are not finite): all mistakes.
+    SolverError
+        If the survey has no stops.
+    """
+    if not survey.stops:
+        raise SolverError(f"survey {survey.survey}: it has no stops, so there is nothing to map")
+    _check(survey)
+    survey = replace(survey, stops=tuple(sorted(survey.stops, key=lambda stop: (stop.leg, stop.stop))))
+    cameras = tuple(Camera(model) for model in survey.rig.cameras)
+    labels = sorted({s.label for stop in survey.stops for s in stop.sightings} | {k.label for k in survey.known_labels})
+    sightings, notes = _sightings(survey, cameras, labels)
+    moves, gaps = _moves(survey)
+    known = _known(survey, labels)
+    roofs = _roofs(survey)
+    frame = "first stop"
+    if len(roofs.stop) >= 2 and np.ptp(np.column_stack([roofs.stop, roofs.beacon]), axis=0).max() > BEACON_SPREAD_M:
+        frame = "roof cameras"
+    elif anchors(known, sightings):
+        frame = "known labels"
+    elif len(roofs.stop):
+        gaps.append("one sighting of a beacon does not fix the world frame, so the roof cameras were not used")
+        roofs = roofs.select(np.zeros(len(roofs.stop), dtype=np.bool_))
+    return Problem(
+        survey=survey,
+        cameras=cameras,
+        R_robot_camera=np.array([c.T_robot_camera[:3, :3] for c in cameras]).reshape(-1, 3, 3),
+        t_robot_camera=np.array([c.T_robot_camera[:3, 3] for c in cameras]).reshape(-1, 3),
+        labels=tuple(labels),
+        sightings=sightings,
+        moves=moves,
+        roofs=roofs,
+        known=known,
+        leg=np.array([stop.leg for stop in survey.stops]),
+        odometry=np.array([pose_array(stop.odometry) for stop in survey.stops]),
+        prior_sigma=_prior_sigma(survey, fixed_first=frame == "first stop"),
+        frame=frame,
+        notes=(*notes, *gaps),
+    )
+
+
+def _check(survey: Survey) -> None:
+    problems: list[str] = []
+    names = [camera.name for camera in survey.rig.cameras]
+    roofs = {roof.name for roof in survey.roof_cameras}
+    where = f"survey {survey.survey}"
+    if len(set(names)) < len(names):
+        problems.append(f"{where}: two cameras of the rig have the same name; names are {', '.join(names)}")
+    for camera in survey.rig.cameras:
+        try:
+            Camera(camera)
+        except ValueError as error:
+            problems.append(f"{where}: {error}")
+    for roof in survey.roof_cameras:
+        if not (np.isfinite(H := np.array(roof.H_world_image)).all() and abs(np.linalg.det(H)) > 1e-12):
+            problems.append(f"{where}: roof camera {roof.name}: H_world_image is not invertible")
+    for known in survey.known_labels:
+        if not np.isfinite([*known.position, known.sigma_m]).all():
+            problems.append(f"{where}: known label {known.label}: position and sigma_m must be finite, got {known}")
+    ids = [known.label for known in survey.known_labels]
+    problems += [f"{where}: known label {i} is listed twice" for i in sorted({i for i in ids if ids.count(i) > 1})]
+    seen: set[tuple[int, int]] = set()
+    unknown: set[str] = set()
+    for stop in survey.stops:
+        at = f"{where}: leg {stop.leg} stop {stop.stop}"
+        if (stop.leg, stop.stop) in seen:
+            problems.append(f"{at} is there twice; remove one")
+        seen.add((stop.leg, stop.stop))
+        numbers = [stop.odometry.x, stop.odometry.y, stop.odometry.heading]
+        if stop.move is not None:
+            numbers += [stop.move.dx, stop.move.dy, stop.move.dheading, *np.ravel(stop.move.covariance)]
+        if not np.isfinite(numbers).all():
+            problems.append(f"{at}: odometry and move must be finite numbers, got {stop.odometry} and {stop.move}")
+        elif stop.move is not None and np.linalg.eigvalsh(np.array(stop.move.covariance)).min() < -1e-9:
+            problems.append(f"{at}: the move's covariance is not positive semidefinite")
+        for s in stop.sightings:
+            if s.camera not in names and s.camera not in unknown:
+                unknown.add(s.camera)
+                expected = ", ".join(names) or "no cameras"
+                problems.append(f"{at}: sighting by unknown camera {s.camera!r}; the rig has {expected}")
+            numbers = [s.u, s.v, 1.0 if s.sigma_px is None else s.sigma_px, s.probability or 0.0]
+            if not (np.isfinite(numbers).all() and numbers[2] > 0.0):
+                problems.append(f"{at}: label {s.label}: u, v must be finite and sigma_px positive, got {s}")
+        for b in stop.beacon_sightings:
+            if b.roof_camera not in roofs or b.beacon not in survey.rig.beacons:
+                problems.append(f"{at}: beacon {b.beacon!r} seen by {b.roof_camera!r}: no such beacon or roof camera")
+            if not np.isfinite([b.u, b.v]).all() or (b.sigma_px is not None and not b.sigma_px > 0.0):
+                problems.append(f"{at}: beacon {b.beacon}: u, v must be finite and sigma_px positive, got {b}")
+    if problems:
+        raise InputError(*problems)
+
+
+def _sightings(survey: Survey, cameras: tuple[Camera, ...], labels: list[str]) -> tuple[Sightings, list[str]]:
+    camera_index = {camera.name: i for i, camera in enumerate(cameras)}
+    label_index = {label: i for i, label in enumerate(labels)}
+    rows = [(f, s) for f, stop in enumerate(survey.stops) for s in stop.sightings]
+    default = survey.sigmas.pixel_px if survey.sigmas.pixel_px > 0.0 else 1.0
+    stop = np.array([f for f, _ in rows], dtype=np.int64)
+    camera = np.array([camera_index[s.camera] for _, s in rows], dtype=np.int64)
+    label = np.array([label_index[s.label] for _, s in rows], dtype=np.int64)
+    uv = np.array([[s.u, s.v] for _, s in rows]).reshape(-1, 2)
+    sigma = np.array([default if s.sigma_px is None else s.sigma_px for _, s in rows])
+    probability = np.array([1.0 if s.probability is None else s.probability for _, s in rows])
+    origin, direction, usable = np.zeros((len(rows), 3)), np.zeros((len(rows), 3)), np.zeros(len(rows), dtype=np.bool_)
+    for c, model in enumerate(cameras):
+        mine = camera == c
+        rays, valid = model.rays(uv[mine])
+        direction[mine] = rays @ model.T_robot_camera[:3, :3].T
+        origin[mine] = model.T_robot_camera[:3, 3]
+        usable[mine] = valid
+    notes = []
+    if not usable.all():
+        notes.append(
+            f"{np.count_nonzero(~usable)} of {len(rows)} sightings lie where the lens model cannot be inverted "
+            "(beyond its valid radius) and were not used"
+        )
+    _, rival = np.unique(np.column_stack([stop, camera, label]), axis=0, return_inverse=True)
+    everything = Sightings(
+        stop=stop,
+        camera=camera,
+        label=label,
+        uv=uv,
+        sigma=np.maximum(sigma, SIGMA_FLOOR_PX),
+        probability=np.clip(probability, 0.01, 1.0),
+        rival=rival.astype(np.int64).ravel(),
+        source=np.arange(len(rows)),
+        origin=origin,
+        direction=direction,
+    )
+    order = np.argsort(camera, kind="stable")
+    return everything.select(order[usable[order]]), notes
+
+
+def _moves(survey: Survey) -> tuple[Moves, list[str]]:
+    after = [f for f in range(1, len(survey.stops)) if survey.stops[f - 1].leg == survey.stops[f].leg]
+    measured, covariance, notes = [], [], []
+    for f in after:
+        stop, before = survey.stops[f], survey.stops[f - 1]
+        if stop.move is not None and stop.stop == before.stop + 1:
+            measured.append(np.array([stop.move.dx, stop.move.dy, stop.move.dheading]))
+            covariance.append(np.array(stop.move.covariance) + COVARIANCE_FLOOR)
+            continue
+        # a stop between is missing, so that the move starts somewhere else; the odometry poses still say something
+        move = se2_relative(pose_array(before.odometry), pose_array(stop.odometry))
+        distance = float(np.hypot(move[0], move[1]))
+        measured.append(move)
+        covariance.append(np.diag([0.02 + 0.05 * distance, 0.02 + 0.05 * distance, 0.05 + 0.05 * distance]) ** 2)
+        notes.append(
+            f"leg {stop.leg}: no move leads from stop {before.stop} to stop {stop.stop}; "
+            "their odometry poses were used instead, with wide margins"
+        )
+    index = np.array(after, dtype=np.int64)
+    return Moves(index - 1, index, np.array(measured).reshape(-1, 3), np.array(covariance).reshape(-1, 3, 3)), notes
+
+
+def _roofs(survey: Survey) -> Roofs:
+    inverse = {roof.name: np.linalg.inv(np.array(roof.H_world_image)) for roof in survey.roof_cameras}
+    rows = [(f, b) for f, stop in enumerate(survey.stops) for b in stop.beacon_sightings]
+    default = survey.sigmas.roof_px if survey.sigmas.roof_px > 0.0 else 1.0
+    return Roofs(
+        stop=np.array([f for f, _ in rows], dtype=np.int64),
+        beacon=np.array([survey.rig.beacons[b.beacon] for _, b in rows]).reshape(-1, 3),
+        uv=np.array([[b.u, b.v] for _, b in rows]).reshape(-1, 2),
+        sigma=np.array([default if b.sigma_px is None else b.sigma_px for _, b in rows]),
+        H_image_world=np.array([inverse[b.roof_camera] for _, b in rows]).reshape(-1, 3, 3),
+    )
+
+
+def _known(survey: Survey, labels: list[str]) -> Known:
+    return Known(
+        label=np.array([labels.index(k.label) for k in survey.known_labels], dtype=np.int64),
+        position=np.array([k.position for k in survey.known_labels]).reshape(-1, 3),
+        sigma=np.array([max(k.sigma_m, 1e-5) for k in survey.known_labels]),
+    )
+
+
+def anchors(known: Known, sightings: Sightings) -> bool:
+    """Two known labels that were seen fix the plane, unless one hangs right above the other (erratum A9)."""
+    seen = known.position[np.isin(known.label, sightings.label)]
+    return len(seen) >= 2 and bool(np.ptp(seen[:, :2], axis=0).max() > 0.1)
+
+
+def _prior_sigma(survey: Survey, fixed_first: bool) -> Floats:
+    p = survey.priors
+    stops = np.tile([np.inf, np.inf, np.inf, p.tilt_rad, p.tilt_rad], (len(survey.stops), 1))
+    if fixed_first:
+        stops[0, :3] = 0.0
+    one = [p.camera_rotation_rad] * 3 + [p.camera_translation_m] * 3 + [p.focal_px] * 2 + [p.centre_px] * 2
+    cameras = np.tile(one, len(survey.rig.cameras))
+    return np.concatenate([stops.ravel(), cameras, [p.odometry_scale, p.odometry_turn]])

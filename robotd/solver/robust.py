@@ -1,0 +1,340 @@
+"""From a survey full of wrong sightings and a slipping wheel to the optimum of what is right.
+
+Several starts descend through a sequence of ever stricter robust losses; between them every label is triangulated anew,
+which frees labels that a reflection had drawn to the wrong place. The lowest robust cost wins; once two starts meet in
+it, no more are tried. The sightings that the winner explains are then adjusted by least squares, because the strictest
+robust loss costs a few per cent of accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..records import Floats
+from .bundle import SQUARE, Adjustment, Loss, Solution
+from .covariance import Covariance, covariance
+from .initial import epipolar_moves, triangulate, world_rays
+from .placement import Placement, at_first_stop, detach, place, retriangulate
+from .problem import Bools, Ints, Known, Problem, State, anchors
+
+OUTLIER = 20.0  # squared whitened residual, 2 degrees of freedom: one right sighting in 20 000 exceeds it
+_SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
+_SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # what a slipped move still says: one wheel spun for some centimetres
+_WRONG_KNOWN = 25.0
+_REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tell them apart, slack on the lens
+_CLEAN = 0.97  # share of sightings explained at which no other start can do better
+_SAME = 0.5  # difference of two starts' costs below which they found the same minimum
+_FLOOR_IMAGE_PX = 6.0
+_MEDIAN = 2.0 * np.log(2.0)  # of the squared length of a standard normal vector in the plane
+
+
+@dataclass(frozen=True, slots=True)
+class _Schedule:
+    """One way to start: which moves, how wide the first triangulation, and the losses to descend through."""
+
+    epipolar: bool
+    tolerance: float
+    losses: tuple[Loss, ...]
+
+
+# in order of their success on warehouse surveys with 30 % wrong sightings; they fail on different ones
+_SCHEDULES = (
+    _Schedule(True, 0.03, (Loss("cauchy", 2.5, width=2.0),)),
+    _Schedule(False, 0.06, (Loss("cauchy", 0.5, width=2.0),)),
+    _Schedule(True, 0.06, (Loss("cauchy", 7.5), Loss("geman-mcclure", 2.5))),
+    _Schedule(
+        False, 0.3, (Loss("cauchy", 25.0, width=2.0), Loss("cauchy", 7.5, width=2.0), Loss("cauchy", 2.5, width=2.0))
+    ),
+)
+_TAIL = (Loss("geman-mcclure", 1.0), Loss("geman-mcclure", 1.0), _REFERENCE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimum:
+    """The explained sightings and the state that fits them best.
+
+    `problem` has slipped moves, wrong known labels and unplaced stops taken out. `inlier` (N,) says which of its
+    sightings take part; `adjustment` is their least-squares problem and `state` its optimum. `placed` (S,) are the
+    stops that have a place in the world. `in_floor` (N,) are sightings of a label's reflection in the floor. `gain`
+    (L,) is each label's support, `rival_points` (L, 3) the second best position (NaN where there is none) and
+    `rival_gain` (L,) its support.
+    """
+
+    problem: Problem
+    state: State
+    placed: Bools
+    inlier: Bools
+    adjustment: Adjustment
+    covariance: Covariance
+    in_floor: Bools
+    gain: Floats
+    rival_points: Floats
+    rival_gain: Floats
+    iterations: int
+    converged: bool
+
+
+def optimise(problem: Problem) -> Optimum:
+    """Find the poses, rig and points that explain the sightings, whatever else is among them."""
+    problem, placement, solution, iterations = _best_start(problem)
+    return _finish(detach(problem, placement.placed), placement.placed, solution.state, iterations)
+
+
+def _best_start(problem: Problem) -> tuple[Problem, Placement, Solution, int]:
+    best: tuple[float, Placement, Solution] | None = None
+    iterations = 0
+    for schedule in _SCHEDULES:
+        moves = epipolar_moves(problem, problem.sightings) if schedule.epipolar else problem.moves.measured
+        placement = place(problem, moves, schedule.tolerance)
+        if not placement.placed.any():
+            # only outside references can leave every stop without a place
+            problem = at_first_stop(
+                problem,
+                f"the {problem.frame} could not be matched with the sightings, so the first stop fixes the world "
+                "frame; check their positions and names",
+            )
+            placement = place(problem, moves, schedule.tolerance)
+        solution, spent = _descend(problem, placement, schedule)
+        iterations += spent
+        cost = solution.cost + 1e6 * np.count_nonzero(~placement.placed)
+        agreed = best is not None and abs(cost - best[0]) < _SAME
+        if best is None or cost < best[0]:
+            best = (cost, placement, solution)
+        if agreed or _explained(problem, placement, solution.state) > _CLEAN:
+            break
+    assert best is not None
+    return problem, best[1], best[2], iterations
+
+
+def _descend(problem: Problem, placement: Placement, schedule: _Schedule) -> tuple[Solution, int]:
+    attached = detach(problem, placement.placed)
+    adjustment = Adjustment(attached, attached.sightings)
+    state, iterations = placement.state, 0
+    for loss in schedule.losses:
+        solution = adjustment.solve(state, loss, iterations=12, tolerance=1.0)
+        state, iterations = solution.state, iterations + solution.iterations
+    everywhere = np.ones(problem.stop_count, dtype=np.bool_)
+    for k, loss in enumerate(_TAIL):
+        if k < 2:
+            state, _ = retriangulate(attached, state, _ray_tolerance(attached), everywhere)
+        last = k == len(_TAIL) - 1
+        solution = adjustment.solve(state, loss, iterations=25 if last else 12, tolerance=1e-2 if last else 0.3)
+        state, iterations = solution.state, iterations + solution.iterations
+    return solution, iterations
+
+
+def _ray_tolerance(problem: Problem) -> float:
+    """Four standard deviations of a sighting as an angle, and never less than what tilt and calibration leave."""
+    if len(problem.sightings) == 0:
+        return 0.015
+    focal = min(float(camera.focal.min()) for camera in problem.cameras)
+    return max(0.015, 4.0 * float(np.median(problem.sightings.sigma)) / focal)
+
+
+def _explained(problem: Problem, placement: Placement, state: State) -> float:
+    attached = detach(problem, placement.placed)
+    adjustment = Adjustment(attached, attached.sightings)
+    _, weight = _REFERENCE((adjustment.linearise(state, _REFERENCE).residual ** 2).sum(axis=1))
+    return float((weight > 0.25).mean()) if len(weight) else 1.0
+
+
+def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> Optimum:
+    stated = problem.sightings.sigma
+    problem = _rescaled(problem, _scatter(problem, state))
+    everything = Adjustment(problem, problem.sightings)
+    solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=1e-2)
+    iterations, state = iterations + solution.iterations, solution.state
+    gain, rival_points, rival_gain = _hypotheses(problem, state)
+    better = rival_gain > gain
+    if better.any():
+        state = replace(state, points=np.where(better[:, None], rival_points, state.points))
+        problem = _without_known(problem, state, np.flatnonzero(better[problem.known.label]))
+    for attempt in range(2):
+        problem, state, inlier, adjustment, spent, converged = _least_squares(problem, state)
+        iterations += spent
+        sure = covariance(adjustment, state)
+        factor = _excess(adjustment, state, sure) if attempt == 0 else 1.0
+        if factor == 1.0:
+            break
+        problem = _rescaled(problem, factor)
+    gain, rival_points, rival_gain = _hypotheses(problem, state)
+    factor = float(np.median(problem.sightings.sigma / stated)) if len(stated) else 1.0
+    if factor > 1.0:
+        note = f"sightings scatter {factor:.1f} times as much as their sigma_px says; uncertainties were scaled"
+        problem = replace(problem, notes=(*problem.notes, note))
+    return Optimum(
+        problem,
+        state,
+        placed,
+        inlier,
+        adjustment,
+        sure,
+        _in_floor(problem, state) & ~inlier,
+        gain,
+        rival_points,
+        rival_gain,
+        iterations,
+        converged,
+    )
+
+
+def _least_squares(problem: Problem, state: State) -> tuple[Problem, State, Bools, Adjustment, int, bool]:
+    """Alternate between choosing the explained measurements and fitting them, until the choice stays."""
+    inlier: Bools | None = None
+    iterations = 0
+    for _ in range(8):
+        cleaned = _without_wrong(problem, state)
+        chosen = explained(Adjustment(cleaned, cleaned.sightings), state)
+        if inlier is not None and cleaned is problem and (chosen == inlier).all():
+            break
+        problem, inlier = cleaned, chosen
+        # explained sightings count in full, however doubtful their identity looked to the robot
+        certain = replace(problem.sightings.select(inlier), probability=np.ones(np.count_nonzero(inlier)))
+        adjustment = Adjustment(problem, certain)
+        solution = adjustment.solve(state, SQUARE, iterations=30, tolerance=1e-4)
+        state, iterations = solution.state, iterations + solution.iterations
+    assert inlier is not None
+    return problem, state, inlier, adjustment, iterations, solution.converged
+
+
+def explained(everything: Adjustment, state: State) -> Bools:
+    """Which sightings the state explains: at most one of each group of rivals, labels only from two stops or more."""
+    problem, sightings = everything.problem, everything.sightings
+    linear = everything.linearise(state, SQUARE)
+    square = (linear.residual**2).sum(axis=1)
+    good = linear.valid & (square < OUTLIER)
+    best = np.full(int(sightings.rival.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(best, sightings.rival, square)
+    good &= square <= best[sightings.rival]
+    pairs = np.unique(np.column_stack([sightings.label[good], sightings.stop[good]]), axis=0)
+    stops = np.bincount(pairs[:, 0], minlength=len(problem.labels))
+    stops[problem.known.label] += 1
+    return np.asarray(good & (stops[sightings.label] >= 2))
+
+
+def _without_wrong(problem: Problem, state: State) -> Problem:
+    """Loosen moves that disagree with everything else (wheels slip) and drop known labels that do.
+
+    Returns the problem itself if nothing was wrong.
+    """
+    everything = Adjustment(problem, problem.sightings)
+    linear = everything.linearise(state, SQUARE)
+    moves, known, notes = problem.moves, problem.known, list(problem.notes)
+    slipped = (linear.move**2).sum(axis=1) > _SLIP
+    if slipped.any():
+        covariance_ = np.where(slipped[:, None, None], moves.covariance + _SLIPPED, moves.covariance)
+        moves = replace(moves, covariance=covariance_)
+        for m in np.flatnonzero(slipped):
+            stop = problem.survey.stops[moves.after[m]]
+            sigmas = float(np.sqrt((linear.move[m] ** 2).sum()))
+            at = f"leg {stop.leg} stop {stop.stop}: the move to it"
+            if not any(note.startswith(at) for note in notes):
+                said = f"{sigmas:.0f} standard deviations from what the sightings say"
+                notes.append(f"{at} is {said}; treated as a wheel slip")
+        problem = replace(problem, moves=moves, notes=tuple(notes))
+    excess = np.linalg.norm(state.points[known.label] - known.position, axis=1) / known.sigma
+    excess[~np.isin(known.label, problem.sightings.label)] = 0.0
+    worst = np.argsort(excess)[-1:]  # one at a time, because a wrong one drags others with it
+    return _without_known(problem, state, worst[excess[worst] ** 2 > _WRONG_KNOWN])
+
+
+def _without_known(problem: Problem, state: State, wrong: Ints) -> Problem:
+    """Drop wrong known labels and name them, as long as enough remain to fix the world frame."""
+    for k in sorted(wrong.tolist(), reverse=True):
+        known = problem.known
+        miss = 1000.0 * float(np.linalg.norm(state.points[known.label[k]] - known.position[k]))
+        named = f"known label {problem.labels[known.label[k]]} is"
+        if any(note.startswith(named) for note in problem.notes):
+            continue
+        said = f"{named} {miss:.0f} mm from where the sightings put it"
+        keep = np.arange(len(known.label)) != k
+        rest = replace(known, label=known.label[keep], position=known.position[keep], sigma=known.sigma[keep])
+        if problem.frame == "known labels" and not anchors(rest, problem.sightings):
+            note = f"{said}, but too few others fix the world frame; measure a third label"
+            problem = replace(problem, notes=(*problem.notes, note))
+        else:
+            note = f"{said}; its measured position was not used"
+            problem = replace(problem, known=rest, notes=(*problem.notes, note))
+    return problem
+
+
+def _scatter(problem: Problem, state: State) -> float:
+    """By how much explained sightings scatter more than their sigma says, from the median; at least 1."""
+    adjustment = Adjustment(problem, problem.sightings)
+    slack = (adjustment.linearise(state, _REFERENCE).residual ** 2).sum(axis=1)
+    near = slack < _REFERENCE.width**2
+    square = (adjustment.linearise(state, SQUARE).residual[near] ** 2).sum(axis=1)
+    unknowns = 3 * len(np.unique(problem.sightings.label[near]))
+    spare = 2 * len(square) - unknowns
+    if spare < 20:
+        return 1.0
+    factor = float(np.sqrt(np.median(square) / _MEDIAN * 2 * len(square) / spare))
+    return factor if factor > 1.3 else 1.0
+
+
+def _excess(adjustment: Adjustment, state: State, sure: Covariance) -> float:
+    """The same for the least-squares optimum, where the expected residuals are known exactly; at least 1."""
+    expected = float((2.0 - sure.leverage).sum())
+    if expected < 20.0:
+        return 1.0
+    found = float((adjustment.linearise(state, SQUARE).residual ** 2).sum())
+    ratio = found / expected
+    return float(np.sqrt(ratio)) if ratio > 1.0 + 3.0 * np.sqrt(2.0 / expected) else 1.0
+
+
+def _rescaled(problem: Problem, factor: float) -> Problem:
+    return replace(problem, sightings=replace(problem.sightings, sigma=problem.sightings.sigma * factor))
+
+
+def _hypotheses(problem: Problem, state: State) -> tuple[Floats, Floats, Floats]:
+    """Support of each label's position, the best position that its other sightings propose, and that one's support.
+
+    The support is the sum over groups of rivals of probability times (1 - squared residual / threshold).
+    """
+    nothing = Known(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
+    fixed = replace(problem, prior_sigma=np.zeros_like(problem.prior_sigma), known=nothing)
+    everything = Adjustment(fixed, problem.sightings)
+    gain, explained_ = _support(everything, state)
+    rest = problem.sightings.select(~explained_)
+    count = len(problem.labels)
+    none = np.full((count, 3), np.nan), np.zeros(count)
+    if len(rest) == 0:
+        return gain, *none
+    origin, direction = world_rays(fixed, rest, state)
+    points, found = triangulate(
+        origin, direction, rest.label, rest.stop, rest.probability, count, _ray_tolerance(problem)
+    )
+    rest = rest.select(found[rest.label])
+    if len(rest) == 0:
+        return gain, *none
+    trial = replace(state, points=np.where(found[:, None], points, state.points))
+    adjustment = Adjustment(fixed, rest)
+    for loss in (Loss("geman-mcclure", 1.0), Loss("geman-mcclure")):
+        trial = adjustment.solve(trial, loss, iterations=12, tolerance=1e-2).state
+    rival_gain, fits = _support(everything, trial)
+    pairs = np.unique(np.column_stack([problem.sightings.label[fits], problem.sightings.stop[fits]]), axis=0)
+    found &= np.bincount(pairs[:, 0], minlength=count) >= 2
+    found &= np.linalg.norm(trial.points - state.points, axis=1) > 0.05
+    return gain, np.where(found[:, None], trial.points, np.nan), np.where(found, rival_gain, 0.0)
+
+
+def _in_floor(problem: Problem, state: State) -> Bools:
+    """Which sightings lie where the floor would mirror their label; its tilt and waves move images by some pixels."""
+    mirrored = replace(state, points=state.points * [1.0, 1.0, -1.0])
+    linear = Adjustment(problem, problem.sightings).linearise(mirrored, SQUARE)
+    miss = np.linalg.norm(linear.residual, axis=1) * problem.sightings.sigma
+    return np.asarray(linear.valid & (miss < _FLOOR_IMAGE_PX))
+
+
+def _support(everything: Adjustment, state: State) -> tuple[Floats, Bools]:
+    sightings = everything.sightings
+    square = (everything.linearise(state, SQUARE).residual ** 2).sum(axis=1)
+    worth = sightings.probability * np.maximum(1.0 - square / OUTLIER, 0.0)
+    groups, owner = np.unique(sightings.rival, return_inverse=True)
+    best, label = np.zeros(len(groups)), np.zeros(len(groups), dtype=np.int64)
+    np.maximum.at(best, owner.ravel(), worth)
+    label[owner.ravel()] = sightings.label
+    gain = np.bincount(label, best, len(everything.problem.labels)).astype(np.float64)
+    return gain, np.asarray(square < OUTLIER)

@@ -1,0 +1,228 @@
+"""`robotd-solver`: solve and judge surveys in files, and serve robots.
+
+Exit codes: 0 done, 1 it could not be done, 2 the command or a file is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .errors import InputError, RobotdError
+
+if TYPE_CHECKING:
+    from .records import Map, Survey
+
+PORT = 8470
+ALIGNMENTS = ("none", "se2", "se3")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = _parser().parse_args(argv)
+    try:
+        code: int = arguments.run(arguments)
+    except InputError as error:
+        return _complain(error.problems, 2)
+    except RobotdError as error:
+        return _complain([str(error)], 1)
+    except BrokenPipeError:  # the reader of the output has seen enough
+        sys.stderr.close()
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return code
+
+
+def _complain(problems: Sequence[str], code: int) -> int:
+    for problem in problems:
+        print(f"robotd-solver: {problem}", file=sys.stderr)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="robotd-solver", description="Make maps of labels from surveys.")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    solve = commands.add_parser("solve", help="make a map from a survey")
+    solve.add_argument("survey", type=Path, metavar="SURVEY.json")
+    solve.add_argument("-o", "--output", type=Path, metavar="MAP.json", help="where the map goes (default: to stdout)")
+    solve.add_argument("--method", choices=("bundle", "linear"), default="bundle", help="default: bundle")
+    solve.add_argument(
+        "--known", type=Path, metavar="CSV", help="labels of known position: label,x,y,z[,sigma] in metres"
+    )
+    for kind, text in (("csv", "a table"), ("png", "a picture from above"), ("html", "a page to turn around in")):
+        solve.add_argument(f"--{kind}", type=Path, metavar="PATH", help=f"also write {text}")
+    solve.set_defaults(run=_solve)
+
+    evaluate = commands.add_parser("evaluate", help="compare a map with the truth")
+    evaluate.add_argument("map", type=Path, metavar="MAP.json")
+    evaluate.add_argument("--truth", type=Path, metavar="CSV", required=True, help="label,x,y,z in metres")
+    evaluate.add_argument(
+        "--align",
+        choices=ALIGNMENTS,
+        default="none",
+        help="move the map onto the truth first, in the plane or in space",
+    )
+    evaluate.add_argument("--json", action="store_true", help="print one JSON object")
+    evaluate.set_defaults(run=_evaluate)
+
+    check = commands.add_parser("check", help="name every mistake in a survey")
+    check.add_argument("survey", type=Path, metavar="SURVEY.json")
+    check.set_defaults(run=_check)
+
+    serve = commands.add_parser("serve", help="take stops from robots and solve them")
+    serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    serve.add_argument("--port", type=_port, default=PORT, help=f"default: {PORT}; 0 takes a free one")
+    serve.add_argument(
+        "--data", type=Path, metavar="DIR", default=Path("/var/lib/robotd-solver"), help="where surveys are kept"
+    )
+    serve.add_argument("--token-file", type=Path, metavar="FILE", help="the secret that robots must send")
+    serve.set_defaults(run=_serve)
+    return parser
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a number from 0 to 65535")
+    return int(text)
+
+
+def _solve(arguments: argparse.Namespace) -> int:
+    from .files import load_survey, map_to_json, save_map, save_map_csv
+    from .solver import solve
+
+    survey = load_survey(arguments.survey)
+    if arguments.known is not None:
+        survey = _with_known(survey, arguments.known)
+    result = solve(survey, method=arguments.method)
+    if arguments.output is None:
+        sys.stdout.write(map_to_json(result).decode())
+        sys.stdout.flush()
+    else:
+        save_map(result, arguments.output)
+    if arguments.csv is not None:
+        save_map_csv(result, arguments.csv)
+    if arguments.png is not None or arguments.html is not None:
+        _draw(arguments, result, survey)
+    _summarise(result)
+    return 0
+
+
+def _with_known(survey: Survey, path: Path) -> Survey:
+    """The survey with the known labels of a table; they replace those of the same name in the survey."""
+    from .files import check_survey, load_points
+    from .records import KnownLabel
+
+    known = {label.label: label for label in survey.known_labels}
+    for label, (position, sigma) in load_points(path).items():
+        known[label] = KnownLabel(label, position) if sigma is None else KnownLabel(label, position, sigma)
+    joined = dataclasses.replace(survey, known_labels=tuple(known.values()))
+    check_survey(joined, str(path))
+    return joined
+
+
+def _draw(arguments: argparse.Namespace, result: Map, survey: Survey) -> None:
+    from .solver.report import map_html, map_png
+
+    if arguments.png is not None:
+        map_png(arguments.png, result, survey=survey)
+    if arguments.html is not None:
+        map_html(arguments.html, result, survey=survey)
+
+
+def _summarise(result: Map) -> None:
+    """Say on stderr what was made, because stdout may carry the map."""
+    counts = Counter(label.status for label in result.labels)
+    states = ", ".join(
+        f"{counts[name]} {name}" for name in ("placed", "known", "ambiguous", "unplaced") if counts[name]
+    )
+    end = "converged" if result.solver.converged else "did not converge"
+    print(
+        f"{result.survey}: {len(result.labels)} labels ({states or 'none seen'}), {len(result.stops)} stops, "
+        f"{result.rms_px:.2f} px rms, {end} after {result.solver.iterations} iterations",
+        file=sys.stderr,
+    )
+    for label in result.labels:
+        if label.status in ("ambiguous", "unplaced"):
+            print(f"no position for {label.label}: {label.reason or label.status}", file=sys.stderr)
+    for note in result.notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from .config import collect
+    from .files import load_map, load_points
+    from .solver import evaluate
+    from .solver.report import text_table
+
+    problems: list[str] = []
+    result = collect(problems, lambda: load_map(arguments.map))
+    points = collect(problems, lambda: load_points(arguments.truth))
+    if result is None or points is None:
+        raise InputError(*problems)
+    truth = {label: position for label, (position, _) in points.items()}
+    evaluation = evaluate(result, truth, align=arguments.align)
+    if arguments.json:
+        print(
+            json.dumps(
+                {
+                    "labels_total": evaluation.labels_total,
+                    "labels_placed": evaluation.labels_placed,
+                    "error_mm": evaluation.error_mm,
+                }
+            )
+        )
+    else:
+        print(text_table({result.solver.method: evaluation}))
+    return 0
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from .files import load_survey
+
+    survey = load_survey(arguments.survey)
+    stops_of: dict[str, set[tuple[int, int]]] = {}
+    for stop in survey.stops:
+        for sighting in stop.sightings:
+            stops_of.setdefault(sighting.label, set()).add((stop.leg, stop.stop))
+    sightings = sum(len(stop.sightings) for stop in survey.stops)
+    print(f"{arguments.survey}: no mistake; {len(survey.stops)} stops, {len(stops_of)} labels, {sightings} sightings")
+    once = sorted(label for label, stops in stops_of.items() if len(stops) == 1)
+    if once:
+        print(f"seen from one stop only, so that they may get no position: {', '.join(once)}")
+    return 0
+
+
+def _serve(arguments: argparse.Namespace) -> int:
+    token = _read_token(arguments.token_file) if arguments.token_file is not None else None
+    try:
+        from .server.app import serve
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] not in ("fastapi", "uvicorn", "starlette", "pydantic"):
+            raise
+        raise RobotdError(f"serving needs {error.name}, which is not installed; install robotd[solver]") from error
+    serve(arguments.host, arguments.port, arguments.data, token)
+    return 0
+
+
+def _read_token(path: Path) -> str:
+    from .files import read_bytes
+
+    try:
+        token = read_bytes(path).decode("ascii").strip()
+    except UnicodeDecodeError:
+        token = ""
+    if not token or any(not character.isprintable() or character.isspace() for character in token):
+        raise InputError(f"{path}: expected one line of ASCII letters and digits, the secret that robots send")
+    return token
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,245 @@
+"""What must hold in a survey or a map beyond its types: every check adds sentences, none stops at the first mistake."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bind import describe
+from .errors import InputError
+from .records import CameraModel, MappedLabel, Matrix3, Rig, RoofCamera, Stop
+
+T = TypeVar("T")
+
+DISTORTION_LENGTHS = {"brown-conrady": (4, 5, 8), "fisheye": (4,)}  # the coefficient counts OpenCV takes
+ROUNDING = 1e-6  # relative to the largest entry; a covariance printed with seven digits passes
+
+
+class Problems:
+    """Sentences about one file, each with the path of the value in it."""
+
+    def __init__(self, where: str) -> None:
+        self.where = where
+        self.found: list[str] = []
+
+    def add(self, path: str, text: str) -> None:
+        self.found.append(f"{self.where} {path}: {text}")
+
+    def raise_if_any(self) -> None:
+        if self.found:
+            raise InputError(*self.found)
+
+
+def check_header(parts: Mapping[str, Any], problems: Problems) -> None:
+    """Check what a survey says besides its stops; `parts` holds those fields of Survey that could be read."""
+    if parts.get("survey") == "":
+        problems.add("survey", "found an empty text; expected the survey's name")
+    if parts.get("created") is not None:
+        _date(parts["created"], "created", problems)
+    if (sigmas := parts.get("sigmas")) is not None:
+        _above_zero(sigmas.pixel_px, "sigmas.pixel_px", problems)
+        _above_zero(sigmas.roof_px, "sigmas.roof_px", problems)
+    if (priors := parts.get("priors")) is not None:
+        for name in priors.__dataclass_fields__:
+            if getattr(priors, name) < 0:
+                problems.add(f"priors.{name}", f"found {getattr(priors, name):g}; expected 0 (held fixed) or more")
+    if (rig := parts.get("rig")) is not None:
+        if not rig.cameras:
+            problems.add("rig.cameras", "found none; expected at least one camera")
+        _unique([camera.name for camera in rig.cameras], "rig.cameras", "name", problems)
+        for index, camera in enumerate(rig.cameras):
+            _camera(camera, f"rig.cameras[{index}]", problems)
+    known = [item for item in parts.get("known_labels") or () if item is not None]
+    _unique([item.label for item in known], "known_labels", "label", problems)
+    for index, item in enumerate(parts.get("known_labels") or ()):
+        if item is not None:
+            _above_zero(item.sigma_m, f"known_labels[{index}].sigma_m", problems)
+    roofs = [roof for roof in parts.get("roof_cameras") or () if roof is not None]
+    _unique([roof.name for roof in roofs], "roof_cameras", "name", problems)
+    for index, roof in enumerate(parts.get("roof_cameras") or ()):
+        if roof is not None:
+            _size(roof.size, f"roof_cameras[{index}].size", problems)
+            if np.linalg.matrix_rank(_scaled(roof.H_world_image)[0]) < 3:
+                problems.add(f"roof_cameras[{index}].H_world_image", "is singular; expected an invertible homography")
+
+
+def check_stops(
+    stops: Iterable[Stop | None] | None, rig: Rig | None, roofs: Iterable[RoofCamera | None] | None, problems: Problems
+) -> None:
+    """Check the stops among themselves and each by itself; a stop that could not be read is None."""
+    last: dict[int, int] = {}
+    complete = True  # until a stop could not be read: after it nobody knows which is the first of its leg
+    for index, stop in enumerate(stops or ()):
+        path = f"stops[{index}]"
+        if stop is None:
+            complete = False
+            continue
+        before = last.get(stop.leg)
+        if before is not None and stop.stop <= before:
+            text = "twice" if stop.stop == before else f"after stop {before}"
+            problems.add(f"{path}.stop", f"leg {stop.leg} has stop {stop.stop} {text}; expected increasing numbers")
+        if before is None and stop.move is not None and complete:
+            problems.add(f"{path}.move", f"is the first stop of leg {stop.leg}; expected null")
+        if before is not None and stop.move is None:
+            mend = "expected the move since the stop before it, or another leg"
+            problems.add(f"{path}.move", f"found null at stop {stop.stop} of leg {stop.leg}; {mend}")
+        last[stop.leg] = max(stop.stop, before or 0)
+        check_stop(stop, f"{path}.", rig, roofs, problems)
+
+
+def check_stop(
+    stop: Stop, path: str, rig: Rig | None, roofs: Iterable[RoofCamera | None] | None, problems: Problems
+) -> None:
+    """Check one stop; `path` starts the paths of its values, e.g. `stops[3].`; without `rig` names are not compared."""
+    for name in ("leg", "stop"):
+        if not 1 <= getattr(stop, name) < 2**31:
+            problems.add(f"{path}{name}", f"found {describe(getattr(stop, name))}; expected a number from 1")
+    _date(stop.time, f"{path}time", problems)
+    if stop.move is not None:
+        _covariance(stop.move.covariance, f"{path}move.covariance", problems)
+    cameras = {camera.name: camera for camera in rig.cameras} if rig else None
+    for index, sighting in _bound(stop.sightings):
+        where = f"{path}sightings[{index}]"
+        if not sighting.label:
+            problems.add(f"{where}.label", "found an empty text; expected the label's id")
+        if sighting.sigma_px is not None:
+            _above_zero(sighting.sigma_px, f"{where}.sigma_px", problems)
+        if sighting.probability is not None and not 0 <= sighting.probability <= 1:
+            problems.add(f"{where}.probability", f"found {sighting.probability:g}; expected 0 to 1")
+        if cameras is not None and _exists(sighting.camera, cameras, f"{where}.camera", "camera of the rig", problems):
+            camera = cameras[sighting.camera]
+            slack = 0.25 if any(camera.distortion) else 1.0  # undistorted pixels of a wide lens lie outside the image
+            _inside(sighting.u, sighting.v, camera.size, slack, where, problems)
+    known = {roof.name: roof for roof in roofs if roof is not None} if roofs is not None else None
+    for index, beacon in _bound(stop.beacon_sightings):
+        where = f"{path}beacon_sightings[{index}]"
+        if beacon.sigma_px is not None:
+            _above_zero(beacon.sigma_px, f"{where}.sigma_px", problems)
+        if rig is not None:
+            _exists(beacon.beacon, rig.beacons, f"{where}.beacon", "beacon of the rig", problems)
+        if known is not None and _exists(beacon.roof_camera, known, f"{where}.roof_camera", "roof camera", problems):
+            _inside(beacon.u, beacon.v, known[beacon.roof_camera].size, 1.0, where, problems)
+
+
+def _bound(items: Iterable[T | None]) -> Iterator[tuple[int, T]]:
+    """Index and item of those that could be read; the others are reported already."""
+    return ((index, item) for index, item in enumerate(items) if item is not None)
+
+
+def check_map(parts: Mapping[str, Any], problems: Problems) -> None:
+    """Check a map; `parts` holds those fields of Map that could be read."""
+    labels = parts.get("labels") or ()
+    _unique([label.label for label in labels if label is not None], "labels", "label", problems)
+    for index, label in enumerate(labels):
+        if label is not None:
+            _mapped_label(label, f"labels[{index}]", problems)
+    seen: set[tuple[int, int]] = set()
+    for index, stop in enumerate(parts.get("stops") or ()):
+        if stop is None:
+            continue
+        if (stop.leg, stop.stop) in seen:
+            problems.add(f"stops[{index}]", f"leg {stop.leg} stop {stop.stop} is given more than once; keep one")
+        seen.add((stop.leg, stop.stop))
+        _covariance(stop.covariance, f"stops[{index}].covariance", problems)
+    for index, sighting in enumerate(parts.get("sightings") or ()):
+        if sighting is not None and not 0 <= sighting.weight <= 1:
+            problems.add(f"sightings[{index}].weight", f"found {sighting.weight:g}; expected 0 to 1")
+    for name in ("cost", "rms_px"):
+        if parts.get(name, 0.0) < 0:
+            problems.add(name, f"found {parts[name]:g}; expected 0 or more")
+
+
+def _mapped_label(label: MappedLabel, path: str, problems: Problems) -> None:
+    if label.status in ("placed", "known") and label.position is None:
+        problems.add(f"{path}.position", f"found null for a label that is {label.status}; expected x, y, z in metres")
+    if label.status == "unplaced" and label.position is not None:
+        problems.add(f"{path}.position", "found a position for a label that is unplaced; expected null")
+    if label.covariance is not None:
+        _covariance(label.covariance, f"{path}.covariance", problems)
+    for name in ("sightings", "inliers"):
+        if getattr(label, name) < 0:
+            problems.add(f"{path}.{name}", f"found {getattr(label, name)}; expected 0 or more")
+
+
+def _camera(camera: CameraModel, path: str, problems: Problems) -> None:
+    _size(camera.size, f"{path}.size", problems)
+    for index in range(2):
+        _above_zero(camera.matrix[index], f"{path}.matrix[{index}]", problems)
+    lengths = DISTORTION_LENGTHS[camera.model]
+    if len(camera.distortion) not in lengths:
+        expected = ", ".join(map(str, lengths[:-1])) + (" or " if lengths[1:] else "") + str(lengths[-1])
+        found = len(camera.distortion)
+        problems.add(f"{path}.distortion", f"found {found} coefficients; expected {expected} for {camera.model}")
+    if camera.valid_radius_px is not None:
+        _above_zero(camera.valid_radius_px, f"{path}.valid_radius_px", problems)
+
+
+def _size(size: tuple[int, int], path: str, problems: Problems) -> None:
+    if not _is_size(size):
+        problems.add(path, f"found {describe(list(size))}; expected width and height, 1 to 65535 pixels")
+
+
+def _is_size(size: tuple[int, int]) -> bool:
+    return all(1 <= length <= 65535 for length in size)
+
+
+def _above_zero(value: float, path: str, problems: Problems) -> None:
+    if value <= 0:
+        problems.add(path, f"found {value:g}; expected above 0")
+
+
+def _unique(names: list[str], path: str, key: str, problems: Problems) -> None:
+    seen: set[str] = set()
+    twice = {name for name in names if name in seen or seen.add(name)}  # type: ignore[func-returns-value]
+    for name in sorted(twice):
+        problems.add(path, f"{key} '{name}' is given {names.count(name)} times; keep one")
+    if "" in names:
+        problems.add(path, f"found an empty {key}; expected a text")
+
+
+def _exists(name: str, known: Mapping[str, Any], path: str, what: str, problems: Problems) -> bool:
+    if name in known:
+        return True
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    expected = f"expected one of {', '.join(sorted(known))}" if known else "there is none in this survey"
+    problems.add(path, f"'{name[:60]}' is no {what}; {hint}{expected}")
+    return False
+
+
+def _inside(u: float, v: float, size: tuple[int, int], slack: float, path: str, problems: Problems) -> None:
+    if not _is_size(size):
+        return  # named already
+    for name, value, length, extent in (("u", u, size[0], "wide"), ("v", v, size[1], "high")):
+        low, high = -0.5 - slack * length, length - 0.5 + slack * length
+        if not low <= value <= high:
+            expected = f"{low:g} to {high:g}, as the image is {length} px {extent}"
+            problems.add(f"{path}.{name}", f"found {value:g}; expected {expected}")
+
+
+def _date(text: str, path: str, problems: Problems) -> None:
+    try:
+        datetime.fromisoformat(text)
+    except ValueError:
+        problems.add(path, f"found '{text[:60]}'; expected a date such as 2026-11-21T10:01:12Z")
+
+
+def _scaled(rows: Matrix3) -> tuple[NDArray[np.float64], float]:
+    """The matrix divided by its largest entry, and that entry (1 for zeros)."""
+    matrix = np.array(rows, dtype=np.float64)
+    scale = float(np.abs(matrix).max()) or 1.0
+    return matrix / scale, scale
+
+
+def _covariance(rows: Matrix3, path: str, problems: Problems) -> None:
+    """Symmetric and positive semi-definite, within rounding."""
+    matrix, scale = _scaled(rows)
+    if np.abs(matrix - matrix.T).max() > ROUNDING:
+        problems.add(path, "is not symmetric; expected a covariance")
+    elif (smallest := np.linalg.eigvalsh(matrix)[0]) < -ROUNDING:
+        problems.add(path, f"has the negative eigenvalue {smallest * scale:g}; expected a covariance")
