@@ -1,0 +1,164 @@
+"""Kernels of robotd.vision.blink: the numpy functions beside them there say what each does.
+
+Pixels are summed in cells of 2x2 and cells in apertures of 2x2, because a light of about one pixel sigma
+keeps most of its signal-to-noise ratio in a 4x4 sum, at a quarter of the work.
+"""
+
+from libc.stdint cimport int8_t, int16_t, uint8_t, uint16_t
+from libc.string cimport memcpy
+
+
+cdef inline int16_t _clipped(int16_t value, int16_t limit) noexcept nogil:
+    value = limit if value > limit else value
+    return -limit if value < -limit else value
+
+
+cdef void _cell_row(const uint8_t* top, const uint8_t* bottom, uint16_t* out, Py_ssize_t columns) noexcept nogil:
+    cdef Py_ssize_t j
+    for j in range(columns):
+        out[j] = <uint16_t>(<uint16_t>(top[2 * j] + top[2 * j + 1]) + <uint16_t>(bottom[2 * j] + bottom[2 * j + 1]))
+
+
+cdef void _difference_row(
+    const uint16_t* now0, const uint16_t* now1, const uint16_t* old0, const uint16_t* old1, int8_t* out, Py_ssize_t columns
+) noexcept nogil:
+    cdef Py_ssize_t j
+    cdef int16_t new, old
+    for j in range(columns - 1):
+        new = <int16_t>(now0[j] + now0[j + 1] + now1[j] + now1[j + 1])
+        old = <int16_t>(old0[j] + old0[j + 1] + old1[j] + old1[j + 1])
+        out[j] = <int8_t>_clipped(<int16_t>(new - old), 63)
+
+
+cdef void _alternation_row(const int8_t* now, const int8_t* old, int16_t* total, Py_ssize_t columns) noexcept nogil:
+    cdef Py_ssize_t j
+    for j in range(columns - 1):
+        total[j] = <int16_t>(total[j] - (<int16_t>(now[j] * old[j]) >> 2))
+
+
+def sum_cells(const uint8_t[:, ::1] image, uint16_t[:, ::1] cells):
+    cdef Py_ssize_t rows = cells.shape[0], columns = cells.shape[1], i
+    with nogil:
+        for i in range(rows):
+            _cell_row(&image[2 * i, 0], &image[2 * i + 1, 0], &cells[i, 0], columns)
+
+
+def accumulate(
+    const uint8_t[:, ::1] image,
+    uint16_t[:, ::1] cells,
+    const uint16_t[:, ::1] lagged,
+    int8_t[:, ::1] difference,
+    const int8_t[:, ::1] lagged_difference,
+    int16_t[:, ::1] total,
+):
+    cdef Py_ssize_t rows = cells.shape[0], columns = cells.shape[1], i
+    with nogil:
+        _cell_row(&image[0, 0], &image[1, 0], &cells[0, 0], columns)
+        for i in range(rows - 1):
+            _cell_row(&image[2 * i + 2, 0], &image[2 * i + 3, 0], &cells[i + 1, 0], columns)
+            _difference_row(&cells[i, 0], &cells[i + 1, 0], &lagged[i, 0], &lagged[i + 1, 0], &difference[i, 0], columns)
+            _alternation_row(&difference[i, 0], &lagged_difference[i, 0], &total[i, 0], columns)
+
+
+def aperture_series(
+    const uint16_t[:, :, ::1] ring,
+    const Py_ssize_t[::1] order,
+    const Py_ssize_t[::1] rows,
+    const Py_ssize_t[::1] columns,
+    const float[::1] light,
+    float[:, ::1] values,
+    float[:, ::1] levels,
+):
+    cdef Py_ssize_t n = rows.shape[0], frames = order.shape[0], c, f, i, j, k, m
+    cdef const uint16_t* cell
+    cdef Py_ssize_t stride = ring.shape[2]
+    cdef float side[8]
+    cdef float keep, level
+    with nogil:
+        for f in range(frames):
+            for c in range(n):
+                i = rows[c]
+                j = columns[c]
+                cell = &ring[order[f], i, j]
+                for k in range(8):
+                    side[k] = 0
+                for k in range(4):  # the four sides of the 8x8 cells around the aperture, in two parts each
+                    m = k - 3
+                    side[0] += light[cell[-3 * stride + m]]
+                    side[1] += light[cell[m * stride + 4]]
+                    side[2] += light[cell[4 * stride + 1 - m]]
+                    side[3] += light[cell[(1 - m) * stride - 3]]
+                for k in range(3):
+                    m = k + 1
+                    side[4] += light[cell[-3 * stride + m]]
+                    side[5] += light[cell[m * stride + 4]]
+                    side[6] += light[cell[4 * stride + 1 - m]]
+                    side[7] += light[cell[(1 - m) * stride - 3]]
+                for k in range(4):
+                    side[k] *= 0.25
+                    side[k + 4] *= <float>(1.0 / 3.0)
+                for k in range(1, 8):
+                    keep = side[k]
+                    m = k - 1
+                    while m >= 0 and side[m] > keep:
+                        side[m + 1] = side[m]
+                        m -= 1
+                    side[m + 1] = keep
+                level = <float>0.25 * (side[2] + side[3] + side[4] + side[5])
+                levels[c, f] = level
+                values[c, f] = (
+                    light[cell[0]] + light[cell[1]] + light[cell[stride]] + light[cell[stride + 1]] - 4 * level
+                )
+
+
+def cut_patches(
+    const uint8_t[:, ::1] image, const Py_ssize_t[::1] rows, const Py_ssize_t[::1] columns, uint8_t[:, :, ::1] patches
+):
+    cdef Py_ssize_t n = rows.shape[0], height = patches.shape[1], width = patches.shape[2], c, i
+    with nogil:
+        for c in range(n):
+            for i in range(height):
+                memcpy(&patches[c, i, 0], &image[rows[c] + i, columns[c]], width)
+
+
+def best_runs(
+    const float[:, ::1] projection,
+    const float[::1] sums,
+    const float[::1] squares,
+    Py_ssize_t step,
+    Py_ssize_t frames,
+    float least,
+    float[::1] gain,
+    Py_ssize_t[::1] start,
+    Py_ssize_t[::1] periods,
+    float[::1] light,
+):
+    cdef Py_ssize_t n = projection.shape[0], starts = projection.shape[1], c, g, k, h
+    cdef float product, total, square, norm, value
+    with nogil:
+        for c in range(n):
+            gain[c] = 0
+            start[c] = 0
+            periods[c] = 2
+            light[c] = 0
+            for g in range(starts - step):
+                product = projection[c, g]
+                total = sums[g]
+                square = squares[g]
+                k = 1
+                h = g + step
+                while h < starts:
+                    product += projection[c, h]
+                    total += sums[h]
+                    square += squares[h]
+                    k += 1
+                    h += step
+                    if product > 0:
+                        norm = square - total * total / frames
+                        norm = norm if norm > least else least
+                        value = product * product / norm
+                        if value > gain[c]:
+                            gain[c] = value
+                            start[c] = g
+                            periods[c] = k
+                            light[c] = product / norm

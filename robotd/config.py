@@ -1,0 +1,187 @@
+"""The robot's configuration (`robotd.toml`) and calibration (`calibration.toml`), strict.
+
+`etc/robotd.toml` explains every key. A driver's section is bound to that driver's own `Config` by `daemon.assemble`
+before any device is opened.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from .bind import bind, ranged
+from .errors import ConfigError, InputError
+from .identify import IdentifyConfig
+from .odometry import Wheels
+from .records import CameraModel, KnownLabel, Priors, Rig, Sigmas, Vector3
+from .safety import SafetyLimits
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class RobotConfig:
+    """[robot]"""
+
+    name: str = "robot"
+    state_directory: Path = Path("/var/lib/robotd")
+    calibration: Path = Path("/var/lib/robotd/calibration.toml")
+
+
+@dataclass(frozen=True, slots=True)
+class MissionConfig:
+    """[mission]"""
+
+    survey: str = "store"
+    stops: tuple[float, ...] = ()
+    labels: tuple[str, ...] = ()
+    known_labels: tuple[KnownLabel, ...] = ()
+    settle_s: float = ranged(0.6, minimum=0.0, maximum=10.0)
+    upload_wait_s: float = ranged(60.0, minimum=0.0)
+    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
+
+    def __post_init__(self) -> None:
+        if any(later <= earlier for earlier, later in zip(self.stops, self.stops[1:], strict=False)):
+            raise ValueError(f"stops = {list(self.stops)}; expected increasing distances in metres")
+        if self.stops and self.stops[0] < 0:
+            raise ValueError(f"stops[0] = {self.stops[0]}; expected at least 0")
+        counts = Counter(self.labels)
+        twice = sorted(label for label, count in counts.items() if count > 1)
+        if twice:
+            raise ValueError(f"labels: {', '.join(twice)} listed more than once; expected every id once")
+
+
+@dataclass(frozen=True, slots=True)
+class UploadConfig:
+    """[upload]"""
+
+    url: str | None = None
+    token_file: Path | None = None
+    retry_s: float = ranged(5.0, minimum=0.1, maximum=3600.0)
+    timeout_s: float = ranged(30.0, minimum=0.1, maximum=600.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """The whole of robotd.toml; `drivers` holds the raw sections."""
+
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    mission: MissionConfig = field(default_factory=MissionConfig)
+    upload: UploadConfig = field(default_factory=UploadConfig)
+    safety: SafetyLimits = field(default_factory=SafetyLimits)
+    drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """The whole of calibration.toml: what calibrations found, and how sure they were (`priors`)."""
+
+    wheels: Wheels = field(default_factory=Wheels)
+    cameras: tuple[CameraModel, ...] = ()
+    floor_camera: CameraModel | None = None
+    beacons: dict[str, Vector3] = field(default_factory=dict)
+    gamma: float = ranged(2.2, minimum=0.5, maximum=4.0)
+    row_time_s: float = ranged(0.0, minimum=0.0, maximum=0.001)
+    priors: Priors = field(default_factory=Priors)
+    sigmas: Sigmas = field(default_factory=lambda: Sigmas(pixel_px=0.2))
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as surveys carry it."""
+        return Rig(self.cameras, self.beacons)
+
+    def camera(self, name: str) -> CameraModel:
+        """One rig camera's model; raises KeyError."""
+        return next(camera for camera in self.cameras if camera.name == name)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file; raises ConfigError that names the file, line and column."""
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; create it or name another one") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 at byte {error.start}; save the file as UTF-8") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {str(error)[:1].lower()}{str(error)[1:]}") from error
+
+
+def load_config(path: Path) -> Config:
+    """Read robotd.toml; relative paths in it are relative to its folder. Raises ConfigError listing every mistake."""
+    problems: list[str] = []
+    data = read_toml(path)
+    for section, entry in (data.get("drivers") or {}).items() if isinstance(data.get("drivers"), dict) else ():
+        if not isinstance(entry, dict):
+            problems.append(f"{path} drivers.{section}: expected a section [drivers.{section}]")
+        elif not isinstance(entry.get("driver"), str):
+            problems.append(
+                f"{path} [drivers.{section}]: missing key 'driver'; expected the name of an installed driver"
+            )
+    config = collect(problems, lambda: bind(Config, data, str(path)))
+    if problems or config is None:
+        raise ConfigError(*problems)
+    return config
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read calibration.toml. Raises ConfigError listing every mistake."""
+    calibration = bind(Calibration, read_toml(path), str(path))
+    names = [camera.name for camera in calibration.cameras]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigError(f"{path} cameras: {', '.join(twice)} defined more than once; expected every name once")
+    return calibration
+
+
+def collect(problems: list[str], make: Callable[[], T]) -> T | None:
+    """Call `make`; if it raises InputError append its problems and return None."""
+    try:
+        return make()
+    except InputError as error:
+        problems.extend(error.problems)
+        return None
+
+
+def save_calibration(calibration: Calibration, path: Path) -> None:
+    """Write calibration.toml so that `load_calibration` reads the same values back; replaces the file atomically."""
+    lines = [f"gamma = {calibration.gamma!r}", f"row_time_s = {calibration.row_time_s!r}"]
+    for section in ("wheels", "priors", "sigmas"):
+        record = getattr(calibration, section)
+        lines += ["", f"[{section}]", *_assignments(record)]
+    lines += ["", "[beacons]", *(f"{json.dumps(name)} = {list(at)!r}" for name, at in calibration.beacons.items())]
+    for camera in calibration.cameras:
+        lines += ["", "[[cameras]]", *_assignments(camera)]
+    if calibration.floor_camera is not None:
+        lines += ["", "[floor_camera]", *_assignments(calibration.floor_camera)]
+    part = path.with_name(path.name + ".part")
+    part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    part.replace(path)
+
+
+def _assignments(record: Any) -> list[str]:
+    return [
+        f"{item.name} = {_toml(getattr(record, item.name))}"
+        for item in fields(record)
+        if getattr(record, item.name) is not None
+    ]
+
+
+def _toml(value: Any) -> str:
+    if is_dataclass(value):
+        return "{ " + ", ".join(_assignments(value)) + " }"
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    return json.dumps(str(value))

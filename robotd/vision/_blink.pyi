@@ -1,0 +1,36 @@
+import numpy as np
+from numpy.typing import NDArray
+
+def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint16]) -> None: ...
+def accumulate(
+    image: NDArray[np.uint8],
+    cells: NDArray[np.uint16],
+    lagged: NDArray[np.uint16],
+    difference: NDArray[np.int8],
+    lagged_difference: NDArray[np.int8],
+    total: NDArray[np.int16],
+) -> None: ...
+def aperture_series(
+    ring: NDArray[np.uint16],
+    order: NDArray[np.intp],
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    light: NDArray[np.float32],
+    values: NDArray[np.float32],
+    levels: NDArray[np.float32],
+) -> None: ...
+def cut_patches(
+    image: NDArray[np.uint8], rows: NDArray[np.intp], columns: NDArray[np.intp], patches: NDArray[np.uint8]
+) -> None: ...
+def best_runs(
+    projection: NDArray[np.float32],
+    sums: NDArray[np.float32],
+    squares: NDArray[np.float32],
+    step: int,
+    frames: int,
+    least: float,
+    gain: NDArray[np.float32],
+    start: NDArray[np.intp],
+    periods: NDArray[np.intp],
+    light: NDArray[np.float32],
+) -> None: ...
