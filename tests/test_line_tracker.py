@@ -1,0 +1,225 @@
+"""The top view, and the memory of the line: what it bridges, corrects and refuses."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from robotd.records import CameraModel, Line, Pose, Transform
+from robotd.vision.line_tracker import LineTracker, PoseHistory
+from robotd.vision.stroke import LineConfig, LineDetector
+from robotd.vision.top_view import TopView
+
+
+def floor_camera(distortion=(-0.05, 0.01, 0.0002, -0.0002, 0.0)):
+    """0.30 m high, 35 degrees down, looking forward."""
+    c, s = math.cos(math.radians(35)), math.sin(math.radians(35))
+    R = np.array([[0.0, -s, c], [-1.0, 0.0, 0.0], [0.0, -c, -s]])
+    rotation, _ = cv2.Rodrigues(R)
+    mount = Transform(tuple(float(x) for x in rotation.ravel()), (0.12, 0.0, 0.30))
+    return CameraModel("floor", (320, 240), (228.5, 228.5, 159.5, 119.5), mount, distortion=distortion)
+
+
+VIEW = TopView(floor_camera())
+
+
+def straight_history(*, speed=0.2, turn_rate=0.0, duration=3.0):
+    history = PoseHistory(duration + 1.0)
+    x = y = heading = 0.0
+    for k in range(int(duration / 0.015)):
+        history.add(k * 0.015, Pose(x, y, heading))
+        middle = heading + 0.5 * turn_rate * 0.015
+        x, y, heading = x + 0.015 * speed * math.cos(middle), y + 0.015 * speed * math.sin(middle), heading
+        heading += turn_rate * 0.015
+    return history
+
+
+def seen(path, pose, noise=0.0, seed=0):
+    """The Line that the detector would find of a path in odometry axes."""
+    away = path - np.array([pose.x, pose.y])
+    c, s = math.cos(pose.heading), math.sin(pose.heading)
+    robot = np.column_stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]])
+    robot = robot[VIEW.shows(robot)]
+    robot = robot + np.random.default_rng(seed).normal(0.0, noise, robot.shape)
+    return [Line(VIEW.to_pixels(robot), 14.0, 0.9)] if len(robot) > 5 else []
+
+
+def line_along_x(y=0.0, length=4.0):
+    return np.column_stack([np.arange(-0.5, length, 0.01), np.full(round((length + 0.5) / 0.01), y)])
+
+
+def distance_to(points, path):
+    return np.sqrt(((points[:, None] - path[None]) ** 2).sum(axis=2)).min(axis=1)
+
+
+def test_pixels_and_metres_are_inverse():
+    pixels = np.random.default_rng(0).uniform(0, 200, (50, 2))
+    np.testing.assert_allclose(VIEW.to_pixels(VIEW.to_robot(pixels)), pixels, atol=1e-9)
+    top, bottom = VIEW.to_robot(np.array([[100.0, 0.0], [100.0, 200.0]]))
+    left, right = VIEW.to_robot(np.array([[0.0, 100.0], [200.0, 100.0]]))
+    assert top[0] > bottom[0]
+    assert left[1] > right[1]
+
+
+def test_the_view_shows_what_the_camera_sees():
+    robot = np.array([[0.5, 0.0], [0.5, 0.3], [0.1, 0.0], [0.32, 0.4], [-1.0, 0.0], [9.0, 0.0]])
+    assert VIEW.shows(robot).tolist() == [True, True, False, False, False, False]
+    rows = VIEW.image_rows(np.array([[0.3, 0.0], [0.6, 0.0], [1.0, 0.0]]))
+    assert 210 < rows[0] < 240
+    assert rows[0] > rows[1] > rows[2]
+
+
+def test_a_tape_is_found_where_it_lies():
+    """A floor drawn on a grid of 2 mm, seen through the lens: its line comes back to a millimetre."""
+    model = floor_camera()
+    from robotd.geometry.camera import Camera
+
+    lens = Camera(model)
+    v, u = np.mgrid[0:240, 0:320]
+    rays, _ = lens.rays(np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    rays = rays @ lens.T_robot_camera[:3, :3].T
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays[:, 2] < -1e-3, -0.30 / rays[:, 2], 50.0)
+    floor = np.array([0.12, 0.0]) + reach[:, None] * rays[:, :2]
+    across = np.abs((floor[:, 1] - 0.02) * math.cos(0.2) - (floor[:, 0] - 0.3) * math.sin(0.2))
+    image = np.where(across < 0.025, 40.0, 170.0).reshape(240, 320)
+    image = cv2.GaussianBlur(image, (0, 0), 0.8) + np.random.default_rng(0).normal(0, 2, image.shape)
+    top = VIEW.apply(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    lines = LineDetector(LineConfig("dark", (11.0, 18.0))).detect(top, VIEW.valid)
+    assert len(lines) == 1
+    points = VIEW.to_robot(lines[0].points)
+    error = (points[:, 1] - 0.02) * math.cos(0.2) - (points[:, 0] - 0.3) * math.sin(0.2)
+    assert np.abs(error).max() < 0.003
+    assert np.sqrt((error**2).mean()) < 0.001
+
+
+def test_images_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="320x240"):
+        VIEW.apply(np.zeros((480, 640), np.uint8))
+
+
+def test_a_camera_that_sees_no_floor_is_refused():
+    up = floor_camera()
+    up = CameraModel("floor", up.size, up.matrix, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.3)))
+    with pytest.raises(ValueError, match="sees no floor"):
+        TopView(up)
+
+
+def test_poses_are_interpolated_and_unknown_times_refused():
+    history = PoseHistory(1.0)
+    history.add(0.0, Pose(0.0, 0.0, 3.1))
+    history.add(1.0, Pose(-0.2, 0.0, -3.1))
+    pose, speed, turn_rate = history.at(0.5)
+    assert pose.x == pytest.approx(-0.1)
+    assert abs(pose.heading) == pytest.approx(math.pi)
+    assert speed == pytest.approx(0.2)
+    assert turn_rate == pytest.approx(2 * math.pi - 6.2)
+    assert history.at(5.0) is None
+    assert history.at(-1.0) is None
+    history.add(0.5, Pose(9.0, 9.0, 0.0))
+    assert history.at(1.0)[0].x == pytest.approx(-0.2)
+
+
+def test_the_blind_zone_is_bridged_from_the_robot_to_the_first_sight():
+    tracker = LineTracker(VIEW)
+    history = straight_history()
+    assert tracker.observe(seen(line_along_x(), Pose(0, 0, 0)), 0.0, history, 0.0)
+    assert np.abs(tracker.path[:, 1]).max() < 0.002
+    assert tracker.path[0, 0] == pytest.approx(0.0, abs=0.01)
+    assert tracker.path[-1, 0] > 1.0
+
+
+def test_acquisition_takes_the_line_that_runs_along_with_the_robot():
+    tracker = LineTracker(VIEW)
+    across = [Line(VIEW.to_pixels(np.column_stack([np.full(60, 0.5), np.linspace(-0.3, 0.3, 60)])), 14.0, 0.99)]
+    beside = seen(line_along_x(0.3), Pose(0, 0, 0))
+    assert not tracker.observe(across + beside, 0.0, straight_history(), 0.0)
+    assert tracker.observe(across + beside + seen(line_along_x(0.02), Pose(0, 0, 0)), 0.0, straight_history(), 0.0)
+    assert tracker.path[-1, 1] == pytest.approx(0.02, abs=0.005)
+
+
+def drive(tracker, path, history, times, *, stamp_error=0.0, lines=None, noise=0.001):
+    """Show the tracker the path from where the robot truly is; returns how often it saw its line."""
+    count = 0
+    for k, t in enumerate(times):
+        pose = history.at(t)[0]
+        shown = seen(path, pose, noise, k) if lines is None else lines(pose)
+        count += tracker.observe(shown, t - stamp_error, history, 0.2 * t)
+    return count
+
+
+def test_the_memory_follows_the_line_and_forgets_what_is_behind():
+    tracker, path = LineTracker(VIEW), line_along_x(length=8.0)
+    history = straight_history(duration=10.0)
+    times = np.arange(0.0, 9.9, 1 / 30)
+    assert drive(tracker, path, history, times) == len(times)
+    assert np.abs(tracker.path[:, 1]).max() < 0.003
+    assert 1.0 < tracker.path[0, 0] < 1.98
+    assert tracker.path[-1, 0] > 2.9
+    assert np.diff(tracker.path[:, 0]).max() < 0.04
+    assert tracker.lost(0.2 * 9.9) < 0.06
+
+
+def test_a_parallel_line_beside_ours_is_not_taken():
+    tracker, path = LineTracker(VIEW), line_along_x(length=8.0)
+    history = straight_history(duration=6.0)
+    drive(tracker, path, history, np.arange(0.0, 1.0, 1 / 30))
+    other = line_along_x(0.15, length=8.0)
+    assert drive(tracker, path, history, np.arange(1.0, 2.0, 1 / 30), lines=lambda pose: seen(other, pose)) == 0
+    assert np.abs(tracker.path[:, 1]).max() < 0.003
+
+
+def test_metres_without_sight_are_counted_also_if_frames_stop():
+    tracker, path = LineTracker(VIEW), line_along_x(length=8.0)
+    history = straight_history(duration=6.0)
+    drive(tracker, path, history, np.arange(0.0, 2.0, 1 / 30))
+    drive(tracker, path, history, np.arange(2.0, 3.0, 1 / 30), lines=lambda pose: [])
+    assert tracker.lost(0.6) == pytest.approx(0.2, abs=0.02)
+    assert tracker.lost(0.8) == pytest.approx(0.35, abs=0.02)
+
+
+def test_a_sharp_corner_is_remembered_round_its_edge():
+    one = np.column_stack([np.arange(-0.5, 1.0, 0.01), np.zeros(150)])
+    two = np.column_stack([np.full(100, 1.0), np.arange(0.0, 1.0, 0.01)])
+    path = np.vstack([one, two])
+    tracker, history = LineTracker(VIEW), straight_history(duration=4.0)
+    drive(tracker, path, history, np.arange(0.0, 3.0, 1 / 30))
+    assert distance_to(tracker.path, path).max() < 0.012
+    assert tracker.path[-1, 1] > 0.2
+
+
+def test_a_slip_of_a_wheel_is_corrected_within_a_third_of_a_second():
+    tracker, path = LineTracker(VIEW), line_along_x(length=8.0)
+    history = straight_history(duration=6.0)
+    drive(tracker, path, history, np.arange(0.0, 2.0, 1 / 30))
+    pivot, turn = history.at(2.0)[0], 0.12
+    c, s = math.cos(-turn), math.sin(-turn)
+    away = path - [pivot.x, pivot.y]
+    slipped = np.column_stack([c * away[:, 0] - s * away[:, 1], s * away[:, 0] + c * away[:, 1]]) + [pivot.x, pivot.y]
+    drive(tracker, slipped, history, np.arange(2.0, 2.33, 1 / 30))
+    near = tracker.path[(tracker.path[:, 0] > pivot.x) & (tracker.path[:, 0] < pivot.x + 0.6)]
+    assert distance_to(near, slipped).max() < 0.012
+
+
+@pytest.mark.parametrize("stamp_error", [-0.04, 0.0, 0.04])
+def test_the_error_of_the_stamps_is_learned_where_turns_begin_and_end(stamp_error):
+    """Turning at 0.6 rad/s, stamps 40 ms off turn what is seen by 24 mrad; on a straight line they turn nothing."""
+    s = np.arange(0.0, 2.4, 0.003)
+    curvature = np.where((s // 0.4) % 2 == 1, np.where((s // 0.8) % 2 == 1, -3.0, 3.0), 0.0)
+    heading = np.cumsum(curvature * 0.003)
+    path = np.cumsum(0.003 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    history = PoseHistory(20.0)
+    for k in range(len(s)):
+        history.add(0.015 * k, Pose(path[k, 0], path[k, 1], heading[k]))
+    tracker = LineTracker(VIEW)
+    drive(tracker, path, history, np.arange(0.1, 9.0, 1 / 30), stamp_error=stamp_error)
+    assert tracker.stamp_error == pytest.approx(stamp_error, abs=0.015)
+    near = tracker.path[distance_to(tracker.path, path[450:620]) < 0.03]
+    assert distance_to(near, path).max() < 0.008
+
+
+def test_frames_from_unknown_times_change_nothing():
+    tracker, history = LineTracker(VIEW), straight_history()
+    assert not tracker.observe(seen(line_along_x(), Pose(0, 0, 0)), 99.0, history, 0.0)
+    assert len(tracker.path) == 0
