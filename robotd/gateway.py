@@ -1,0 +1,357 @@
+"""robotd-labels: brings flash requests into the folder that the label system watches.
+
+The label system (thesis section 6.3.6) scans a folder of text files every few seconds and says nothing back. This
+program runs beside it, also on Windows, as this one file. It speaks JSON over TCP, one object a line:
+
+    {"id": 1, "token": "...", "method": "flash", "labels": ["4711"], "duration": 3, "strength": 1.0, "key": "a1b2"}
+    {"id": 1, "ok": true}                          the instruction file is in the folder
+    {"id": 1, "ok": false, "error": "..."}         it is not; the text says why
+    {"id": 2, "token": "...", "method": "status"}  answered by {"id": 2, "ok": true, "waiting": 0}
+
+A request that carries a `key` (any text, unique) may be sent again after a lost connection: it is obeyed once. The
+order on the disk makes that hold through a crash: the file is written under a working name, then noted in the log with
+its key, then renamed into the folder. At a start, files that are noted are renamed and the others, which nobody was
+told about, are deleted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import hmac
+import json
+import os
+import re
+import signal
+import string
+import sys
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+TEMPLATE = "FLASH;{label};{duration};{strength}"
+FIELDS = ("label", "duration", "strength")
+LINE_LIMIT = 1 << 16  # bytes of one request
+LABEL_LIMIT = 500  # labels of one request
+WAITING_LIMIT = 1000  # instruction files that the label system has not fetched
+CLIENT_LIMIT = 32  # connections
+LOG_LIMIT = 4 << 20  # bytes; then the log is put aside as log.1
+KEYS = 10_000  # keys remembered
+_FILE = re.compile(r"robotd-(\d{12})\.txt")
+
+
+class RefusedError(Exception):
+    """The request cannot be obeyed; the message goes back to whoever sent it."""
+
+
+class Outbox:
+    """The watched folder: writes each instruction file once, with increasing names.
+
+    Parameters
+    ----------
+    folder : Path
+        The one that the label system watches.
+    template : str
+        One line of an instruction file, in Python's format syntax, with label, duration (s) and strength (0..1).
+    """
+
+    def __init__(self, folder: Path, template: str = TEMPLATE) -> None:
+        self.folder = folder
+        self.work = folder / ".robotd-labels"
+        self.log = self.work / "log"
+        self.template = template
+        self.separators = _check_template(template)
+        self.number = 0
+        self.keys: OrderedDict[str, None] = OrderedDict()
+
+    def open(self) -> None:
+        """Finish what a crash left undone; raises OSError if the folder cannot be used."""
+        self.work.mkdir(exist_ok=True)
+        noted = set()
+        for entry in self._entries():
+            noted.add(entry["file"])
+            self._remember(entry.get("key"))
+        for path in sorted(self.work.glob("robotd-*.txt")):
+            if path.name in noted:
+                os.replace(path, self.folder / path.name)
+            else:
+                path.unlink()
+        names = [*noted, *(path.name for path in self.folder.iterdir())]
+        self.number = max((int(match[1]) for name in names if (match := _FILE.fullmatch(name))), default=0)
+
+    def flash(self, labels: list[str], duration: int, strength: float, key: str | None, sender: str) -> None:
+        """Put one instruction file into the folder; raises RefusedError."""
+        if key is not None and key in self.keys:
+            return
+        if (waiting := self.waiting()) >= WAITING_LIMIT:
+            raise RefusedError(
+                f"{waiting} instruction files wait in {self.folder}; is the label system running and watching it?"
+            )
+        lines = [self.template.format(label=label, duration=duration, strength=strength) + "\n" for label in labels]
+        name = f"robotd-{self.number + 1:012d}.txt"
+        path = self.work / name
+        try:
+            _write(path, "wb", "".join(lines).encode())
+            date = path.stat().st_mtime
+            entry = {"file": name, "date": date, "key": key, "sender": sender}
+            self._note({**entry, "labels": labels, "duration": duration, "strength": strength})
+            self.number += 1
+            os.replace(path, self.folder / name)
+        except OSError as error:
+            with suppress(OSError):
+                path.unlink()  # a restart must not obey what is refused now
+            raise RefusedError(f"{self.folder} cannot be written: {error.strerror or error}") from error
+        self._remember(key)
+
+    def waiting(self) -> int:
+        """How many of our files the label system has not fetched yet."""
+        return sum(1 for name in os.listdir(self.folder) if _FILE.fullmatch(name))
+
+    def _note(self, entry: dict[str, Any]) -> None:
+        with suppress(FileNotFoundError):
+            if self.log.stat().st_size > LOG_LIMIT:
+                os.replace(self.log, self.log.with_suffix(".1"))
+        begin = b"" if self._log_is_whole() else b"\n"
+        _write(self.log, "ab", begin + json.dumps(entry).encode() + b"\n")
+
+    def _log_is_whole(self) -> bool:
+        """Whether the last line was not cut off by a crash or a full disk."""
+        try:
+            with open(self.log, "rb") as file:
+                if file.seek(0, os.SEEK_END) == 0:
+                    return True
+                file.seek(-1, os.SEEK_END)
+                return file.read() == b"\n"
+        except FileNotFoundError:
+            return True
+
+    def _entries(self) -> Iterator[dict[str, Any]]:
+        """What the log says, oldest first; a line that a crash cut off was never acted on."""
+        for path in (self.log.with_suffix(".1"), self.log):
+            with suppress(FileNotFoundError):
+                for line in path.read_bytes().split(b"\n"):
+                    with suppress(ValueError):
+                        entry = json.loads(line)
+                        if isinstance(entry, dict) and isinstance(entry.get("file"), str):
+                            yield entry
+
+    def _remember(self, key: Any) -> None:
+        if isinstance(key, str):
+            self.keys[key] = None
+            while len(self.keys) > KEYS:
+                self.keys.popitem(last=False)
+
+
+class Gateway:
+    """Answers requests, one after the other, on any number of connections."""
+
+    def __init__(self, outbox: Outbox, token: str | None) -> None:
+        self.outbox = outbox
+        self.token = token
+        self.clients: set[asyncio.Task[None]] = set()
+
+    async def serve(self, host: str, port: int) -> None:
+        """Listen until cancelled; prints the address when it is ready."""
+        server = await asyncio.start_server(self._connected, host, port, limit=LINE_LIMIT)
+        address = server.sockets[0].getsockname()
+        print(f"robotd-labels: listening on {address[0]}:{address[1]}", flush=True)
+        try:
+            async with server:
+                await _until_told()
+                server.close()
+                for client in self.clients:
+                    client.cancel()
+        finally:
+            await asyncio.gather(*self.clients, return_exceptions=True)
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self.clients.add(task)
+        sender = str((writer.get_extra_info("peername") or ("?",))[0])
+        try:
+            if len(self.clients) > CLIENT_LIMIT:
+                writer.write(_answer(None, f"more than {CLIENT_LIMIT} connections; close one"))
+                return
+            while line := await _line(reader):
+                writer.write(self.answer(line, sender))
+                await writer.drain()
+        except ValueError:  # asyncio's word for a line beyond the limit: where the next one begins is unknown
+            writer.write(_answer(None, f"a line of more than {LINE_LIMIT} bytes; send less"))
+        except (OSError, asyncio.CancelledError):
+            pass
+        finally:
+            self.clients.discard(task)
+            writer.close()
+            with suppress(OSError, asyncio.CancelledError):
+                await writer.wait_closed()
+
+    def answer(self, line: bytes, sender: str = "?") -> bytes:
+        """The answer to one line, whatever is in it."""
+        number: Any = None
+        try:
+            try:
+                request = json.loads(line)
+            except (ValueError, RecursionError):
+                raise RefusedError("not JSON; expected one object a line") from None
+            if not isinstance(request, dict):
+                raise RefusedError(f"found {type(request).__name__}; expected an object in braces")
+            number = request.pop("id", None)
+            if number is not None and (isinstance(number, bool) or not isinstance(number, int | str)):
+                number = None
+                raise RefusedError("id: expected a number or a text")
+            self._check_token(request.pop("token", None))
+            return _answer(number, **self._obey(request, sender))
+        except RefusedError as error:
+            return _answer(number, str(error))
+
+    def _check_token(self, given: Any) -> None:
+        if self.token is None:
+            return
+        if not isinstance(given, str) or not hmac.compare_digest(
+            given.encode(errors="replace"), self.token.encode(errors="replace")
+        ):
+            raise RefusedError("token: missing or wrong; it is in the gateway's --token-file")
+
+    def _obey(self, request: dict[str, Any], sender: str) -> dict[str, Any]:
+        method = request.pop("method", None)
+        if method == "status":
+            _check_keys(request, set(), set())
+            return {"waiting": self.outbox.waiting()}
+        if method != "flash":
+            raise RefusedError(f"method: found {_quote(method)}; expected flash or status")
+        _check_keys(request, {"labels", "duration"}, {"strength", "key"})
+        labels, duration = request["labels"], request["duration"]
+        strength, key = request.get("strength", 1.0), request.get("key")
+        if not isinstance(labels, list) or not 1 <= len(labels) <= LABEL_LIMIT:
+            raise RefusedError(f"labels: expected a list of 1 to {LABEL_LIMIT} label ids")
+        for label in labels:
+            self._check_label(label)
+        if not _is_number(duration) or not 1 <= duration <= 255 or duration % 1 != 0:
+            raise RefusedError(f"duration: found {_quote(duration)}; expected whole seconds from 1 to 255")
+        if not _is_number(strength) or not 0 < strength <= 1:
+            raise RefusedError(f"strength: found {_quote(strength)}; expected above 0, at most 1")
+        if key is not None and (not isinstance(key, str) or not 1 <= len(key) <= 100):
+            raise RefusedError("key: expected a text of 1 to 100 characters")
+        self.outbox.flash(labels, int(duration), float(strength), key, sender)
+        return {}
+
+    def _check_label(self, label: Any) -> None:
+        if not isinstance(label, str) or not 1 <= len(label) <= 64 or not label.isprintable():
+            raise RefusedError(f"labels: found {_quote(label)}; expected ids of 1 to 64 printable characters")
+        clash = sorted(set(label) & self.outbox.separators)
+        if clash:
+            raise RefusedError(f"labels: {_quote(label)} has {_quote(clash[0])}, which separates in instruction files")
+
+
+async def _line(reader: asyncio.StreamReader) -> bytes:
+    """The next line, or b"" at the end; what comes after the last line break is noise of a broken connection."""
+    while True:
+        line = await reader.readline()
+        if not line.endswith(b"\n"):
+            return b""
+        if line.strip():
+            return line
+
+
+async def _until_told() -> None:
+    """Return at SIGTERM or Ctrl-C."""
+    told = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        try:
+            loop.add_signal_handler(number, told.set)
+        except NotImplementedError:  # Windows
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(told.set))
+    await told.wait()
+
+
+def _answer(number: Any, error: str | None = None, **more: Any) -> bytes:
+    reply = {"id": number, "ok": True, **more} if error is None else {"id": number, "ok": False, "error": error}
+    return json.dumps(reply).encode() + b"\n"
+
+
+def _check_keys(request: dict[str, Any], needed: set[str], optional: set[str]) -> None:
+    missing, unknown = sorted(needed - request.keys()), sorted(request.keys() - needed - optional)
+    problems = [f"missing key '{key}'" for key in missing] + [f"unknown key {_quote(key)}" for key in unknown[:5]]
+    if problems:
+        raise RefusedError(f"{', '.join(problems)}; known are {', '.join(sorted(needed | optional)) or 'none'}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _quote(value: Any) -> str:
+    try:
+        text = json.dumps(value)
+    except (ValueError, RecursionError):
+        return "something else"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _check_template(template: str) -> set[str]:
+    """The characters that separate fields in a line; raises ValueError if the template makes no such line."""
+    names, separators = set(), {"\n", "\r"}
+    for literal, name, _, _ in string.Formatter().parse(template):
+        separators |= {char for char in literal if not char.isalnum()}
+        if name is not None:
+            names.add(name)
+    if unknown := sorted(names - set(FIELDS)):
+        raise ValueError(f"unknown field {{{unknown[0]}}}; known are {', '.join(FIELDS)}")
+    if "label" not in names:
+        raise ValueError("no field {label}")
+    if "\n" in template:
+        raise ValueError("more than one line")
+    template.format(label="A1", duration=3, strength=1.0)
+    return separators
+
+
+def _write(path: Path, mode: str, data: bytes) -> None:
+    with open(path, mode) as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        "robotd-labels", description="Bring flash requests into the label system's folder."
+    )
+    parser.add_argument("--folder", type=Path, required=True, help="the folder that the label system watches")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this computer only)")
+    parser.add_argument("--port", type=int, default=0, help="port to listen on (default: a free one, which is printed)")
+    parser.add_argument("--token-file", type=Path, help="file with the secret that requests must carry")
+    parser.add_argument("--template", default=TEMPLATE, help=f"one line of an instruction file (default: {TEMPLATE})")
+    options = parser.parse_args(arguments)
+    token = None
+    if options.token_file is not None:
+        try:
+            token = options.token_file.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            parser.error(f"--token-file: {error}")
+        if not token:
+            parser.error(f"--token-file: {options.token_file} is empty")
+    elif options.host not in ("127.0.0.1", "::1", "localhost"):
+        parser.error(f"--host {options.host}: without --token-file only 127.0.0.1 may be served")
+    try:
+        outbox = Outbox(options.folder, options.template)
+    except (ValueError, IndexError, KeyError) as error:
+        parser.error(f"--template '{options.template}': {error}; expected for example '{TEMPLATE}'")
+    try:
+        outbox.open()
+        asyncio.run(Gateway(outbox, token).serve(options.host, options.port))
+    except OSError as error:
+        print(
+            f"robotd-labels: {error.filename or f'{options.host} port {options.port}'}: {error.strerror}",
+            file=sys.stderr,
+        )
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

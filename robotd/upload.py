@@ -1,0 +1,236 @@
+"""Bring every record of the journal to the server: at least once, oldest first, until the server says it has it.
+
+A request names the SHA-256 of its body, the server's answer repeats it, and only then is the record acknowledged: an
+answer of something between (a captive portal, a proxy) cannot make a stop disappear. A failure that may pass is tried
+again with growing pauses; a record that the server refuses for its content is reported once and offered again rarely,
+while the others go on. On a virtual loop a request takes no time, so there is no time limit on it either.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+from collections.abc import Callable
+from typing import Any, Literal
+from urllib.parse import quote, urlsplit
+
+import aiohttp
+import yarl
+
+from .clock import in_thread, now, outside
+from .errors import InputError, UploadError
+from .files import map_from_json
+from .journal import Journal, Upload
+from .records import Map
+
+LONGEST = 64  # times retry_s: the longest pause, and the pause between offers of a refused record
+PASSING = (400, 401, 403, 408, 429)  # damaged on the way, a token to be mended on either side, "later"
+SOLVING_S = 600.0  # s, a map of a large store takes minutes
+
+Report = Callable[[str, Literal["info", "warning", "error"]], None]
+
+
+class Uploader:
+    """Sends what waits in the journal.
+
+    Parameters
+    ----------
+    journal : Journal
+    url : str
+        Of the server, e.g. "https://solver.example:8443".
+    token : str or None
+        Secret shared with the server.
+    retry_s : float
+        First pause after a failure in seconds; doubles up to 64 times that.
+    timeout_s : float
+        Longest wait for an answer in seconds.
+    report : callable
+        Gets a sentence and its level, once per change of state.
+
+    Raises
+    ------
+    InputError
+        If the url is not one.
+    """
+
+    def __init__(
+        self, journal: Journal, url: str, token: str | None, retry_s: float, timeout_s: float, report: Report
+    ) -> None:
+        parts = urlsplit(url)
+        if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
+            raise InputError(f"upload.url: found '{url}'; expected an address like https://solver.example:8443")
+        self.journal = journal
+        self.url = url.rstrip("/")
+        self.retry_s = retry_s
+        self.timeout_s = timeout_s
+        self.report = report
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._wake = asyncio.Event()
+        self._empty = asyncio.Event()
+        self._factor = 1
+        self._trouble: str | None = None
+        self._refused: dict[str, float] = {}  # digest -> loop time from which on to offer it again
+
+    def wake(self) -> None:
+        """Say that new records wait in the journal."""
+        self._empty.clear()
+        self._wake.set()
+
+    async def wait_empty(self) -> None:
+        """Wait until the server has everything that was in the journal at the last `wake`."""
+        await self._empty.wait()
+
+    async def run(self) -> None:
+        """Send until cancelled."""
+        async with self._session() as session:
+            while True:
+                self._wake.clear()
+                pause = await self._send_all(session)
+                if pause is None and not self._wake.is_set():
+                    self._empty.set()
+                try:
+                    async with asyncio.timeout(pause):
+                        await self._wake.wait()
+                except TimeoutError:
+                    pass
+
+    async def fetch_map(self, survey: str) -> Map:
+        """The server's map of a survey; waits while it is being solved.
+
+        Raises
+        ------
+        UploadError
+            If the server cannot be reached, says why there is no map, or sends something else.
+        """
+        async with self._session() as session:
+            address = f"{self._address(survey)}/map"
+            body = await self._exchange(session, "GET", address, timeout_s=max(SOLVING_S, self.timeout_s))
+        try:
+            return map_from_json(body, f"the map from {self.url}")
+        except InputError as error:
+            raise UploadError(str(error), permanent=True) from error
+
+    # ---- one round ---------------------------------------------------------------------------------------------------
+
+    async def _send_all(self, session: aiohttp.ClientSession) -> float | None:
+        """Offer everything once; returns seconds until the next try is due, None if nothing is left."""
+        due: list[float] = []
+        held: set[str] = set()  # surveys whose header the server refuses: their stops wait behind it
+        for upload in await in_thread(self.journal.pending):
+            again = self._refused.get(upload.digest, 0.0)
+            if upload.survey in held:
+                continue
+            if again > now():
+                due.append(again)
+                if upload.kind == "header":
+                    held.add(upload.survey)
+                continue
+            try:
+                await self._send(session, upload)
+            except UploadError as error:
+                if not error.permanent:
+                    return self._failed(str(error))
+                if upload.digest not in self._refused:
+                    self.report(f"{_name(upload)} is refused and stays on the robot: {error}", "error")
+                due.append(now() + LONGEST * self.retry_s)
+                self._refused[upload.digest] = due[-1]
+                if upload.kind == "header":
+                    held.add(upload.survey)
+            else:
+                await in_thread(self.journal.acknowledge, upload)
+                self._refused.pop(upload.digest, None)
+                self._succeeded()
+        return max(self.retry_s, min(due) - now()) if due else None
+
+    def _failed(self, trouble: str) -> float:
+        pause = self.retry_s * self._factor
+        self._factor = min(2 * self._factor, LONGEST)
+        if trouble != self._trouble:
+            self.report(f"{trouble}; records are kept and sent again", "warning")
+        self._trouble = trouble
+        return pause
+
+    def _succeeded(self) -> None:
+        if self._trouble is not None:
+            self.report(f"{self.url} takes records again", "info")
+        self._trouble = None
+        self._factor = 1
+
+    async def _send(self, session: aiohttp.ClientSession, upload: Upload) -> None:
+        address = self._address(upload.survey)
+        if upload.kind == "stop":
+            address += f"/legs/{upload.leg}/stops/{upload.stop}"
+        hashed = base64.b64encode(bytes.fromhex(upload.digest)).decode()
+        headers = {"Content-Type": "application/json", "Content-Digest": f"sha-256=:{hashed}:"}  # RFC 9530
+        try:
+            answer = await self._exchange(session, "PUT", address, body=upload.body, headers=headers)
+        except _MissingError as error:
+            if upload.kind == "header":
+                raise
+            await in_thread(self.journal.send_again, upload.survey)
+            raise UploadError(f"{self.url} has lost survey {upload.survey!r}, it gets all of it again") from error
+        try:
+            received = json.loads(answer)["sha256"]
+        except (ValueError, TypeError, KeyError):
+            received = None
+        if received != upload.digest:
+            raise UploadError(
+                f"{self.url} does not answer like a robotd-solver; check upload.url and what is in between"
+            )
+
+    async def _exchange(
+        self,
+        session: aiohttp.ClientSession,
+        method: str,
+        address: str,
+        *,
+        body: bytes | None = None,
+        headers: dict[str, str] | None = None,
+        timeout_s: float | None = None,
+    ) -> bytes:
+        """One request; returns the answer's body. Every failure is an UploadError that names the server."""
+        limit = aiohttp.ClientTimeout(total=timeout_s or self.timeout_s)
+        target = yarl.URL(address, encoded=True)
+        try:
+            with outside():
+                async with session.request(
+                    method, target, data=body, headers=headers, timeout=limit, allow_redirects=False
+                ) as response:
+                    status, answer = response.status, await response.read()
+        except TimeoutError as error:
+            raise UploadError(f"{self.url} did not answer within {limit.total:g} s") from error
+        except (aiohttp.ClientError, OSError) as error:
+            raise UploadError(f"{self.url} cannot be reached: {error or type(error).__name__}") from error
+        if status < 300:
+            return answer
+        text = f"{self.url} answers {status}: {_reason(answer)}"
+        if status == 404:
+            raise _MissingError(text, permanent=True)
+        raise UploadError(text, permanent=400 <= status < 500 and status not in PASSING)
+
+    def _session(self) -> aiohttp.ClientSession:
+        # a connection per request: stops are minutes apart, and a kept one would often be dead
+        return aiohttp.ClientSession(headers=self._headers, connector=aiohttp.TCPConnector(force_close=True))
+
+    def _address(self, survey: str) -> str:
+        return f"{self.url}/api/surveys/{quote(survey, safe='')}"
+
+
+class _MissingError(UploadError):
+    """The server knows nothing under that address."""
+
+
+def _name(upload: Upload) -> str:
+    if upload.kind == "header":
+        return f"survey {upload.survey!r}"
+    return f"survey {upload.survey!r} leg {upload.leg} stop {upload.stop}"
+
+
+def _reason(answer: bytes) -> str:
+    """The problems that our server lists, or the start of what another one says."""
+    try:
+        data: Any = json.loads(answer)
+        return "; ".join(map(str, data["problems"]))
+    except (ValueError, TypeError, KeyError):
+        return answer[:200].decode(errors="replace").strip() or "nothing"

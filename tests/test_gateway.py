@@ -1,0 +1,483 @@
+"""Flash requests reach the watched folder once, whoever dies in between; noise never stops the gateway."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robotd.drivers.pricer import PricerConfig, PricerDriver
+
+import robotd.gateway as gateway
+from robotd.bind import bind
+from robotd.bus import Bus
+from robotd.clock import now, run_virtual
+from robotd.errors import ConfigError, DriverFault, MissionError
+from robotd.gateway import Gateway, Outbox, main
+from robotd.plugin import Labels
+
+TOKEN = "secret"
+FLASH = {"id": 1, "token": TOKEN, "method": "flash", "labels": ["A17", "B 2"], "duration": 3, "strength": 1.0}
+
+
+@pytest.fixture
+def desk(tmp_path):
+    return make_desk(tmp_path)
+
+
+def make_desk(folder):
+    outbox = Outbox(folder)
+    outbox.open()
+    return Gateway(outbox, TOKEN)
+
+
+def ask(desk, request):
+    line = request if isinstance(request, bytes) else json.dumps(request).encode()
+    return json.loads(desk.answer(line))
+
+
+def files(folder):
+    return {path.name: path.read_text() for path in sorted(folder.glob("*.txt"))}
+
+
+# ---- requests --------------------------------------------------------------------------------------------------------
+
+
+def test_a_flash_becomes_one_instruction_file(desk, tmp_path):
+    assert ask(desk, FLASH) == {"id": 1, "ok": True}
+    assert ask(desk, {**FLASH, "id": "x", "labels": ["C1"], "duration": 255, "strength": 0.5}) == {
+        "id": "x",
+        "ok": True,
+    }
+    assert files(tmp_path) == {
+        "robotd-000000000001.txt": "FLASH;A17;3;1.0\nFLASH;B 2;3;1.0\n",
+        "robotd-000000000002.txt": "FLASH;C1;255;0.5\n",
+    }
+    assert ask(desk, {"id": 2, "token": TOKEN, "method": "status"}) == {"id": 2, "ok": True, "waiting": 2}
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"token": "wrong"}, "token: missing or wrong"),
+        ({"token": None}, "token: missing or wrong"),
+        ({"token": "\ud800"}, "token: missing or wrong"),
+        ({"method": "glow"}, 'method: found "glow"; expected flash or status'),
+        ({"method": None}, "method: found null"),
+        ({"id": [1]}, "id: expected a number or a text"),
+        ({"labels": []}, "labels: expected a list of 1 to 500"),
+        ({"labels": "A1"}, "labels: expected a list"),
+        ({"labels": ["A1"] * 501}, "labels: expected a list of 1 to 500"),
+        ({"labels": ["A;1"]}, 'has ";", which separates'),
+        ({"labels": ["A\n1"]}, "printable"),
+        ({"labels": [17]}, "labels: found 17"),
+        ({"labels": ["x" * 65]}, "1 to 64 printable"),
+        ({"labels": ["\ud800"]}, "printable"),
+        ({"duration": 2.5}, "duration: found 2.5; expected whole seconds from 1 to 255"),
+        ({"duration": 0}, "expected whole seconds from 1 to 255"),
+        ({"duration": 256}, "expected whole seconds from 1 to 255"),
+        ({"duration": True}, "expected whole seconds"),
+        ({"duration": float("nan")}, "expected whole seconds"),
+        ({"duration": float("inf")}, "expected whole seconds"),
+        ({"duration": "3"}, "expected whole seconds"),
+        ({"strength": 0}, "strength: found 0; expected above 0, at most 1"),
+        ({"strength": 1.1}, "strength"),
+        ({"strength": float("nan")}, "strength"),
+        ({"key": ""}, "key: expected a text"),
+        ({"key": 5}, "key: expected a text"),
+        ({"colour": "green"}, 'unknown key "colour"; known are duration, key, labels, strength'),
+    ],
+)
+def test_bad_requests_are_refused_with_the_reason(desk, tmp_path, change, text):
+    reply = ask(desk, {**FLASH, **change})
+    assert reply["ok"] is False
+    assert text in reply["error"]
+    assert files(tmp_path) == {}
+
+
+def test_missing_keys_are_named_together(desk):
+    reply = ask(desk, {"token": TOKEN, "method": "flash"})
+    assert reply["error"].startswith("missing key 'duration', missing key 'labels'; known are")
+
+
+def test_the_queue_has_a_limit(desk, tmp_path, monkeypatch):
+    monkeypatch.setattr(gateway, "WAITING_LIMIT", 2)
+    assert ask(desk, FLASH)["ok"]
+    assert ask(desk, FLASH)["ok"]
+    assert "2 instruction files wait in" in ask(desk, FLASH)["error"]
+    (tmp_path / "robotd-000000000001.txt").unlink()
+    assert ask(desk, FLASH)["ok"]
+
+
+def test_a_folder_that_cannot_be_written_is_an_answer(desk, tmp_path):
+    shutil.rmtree(tmp_path / ".robotd-labels")
+    assert "cannot be written: No such file or directory" in ask(desk, FLASH)["error"]
+    (tmp_path / ".robotd-labels").mkdir()
+    assert ask(desk, FLASH)["ok"]
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.just(TOKEN),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=80) | st.builds(lambda value: json.dumps(value).encode(), values))
+def test_any_line_has_an_answer(tmp_path_factory, line):
+    desk = make_desk(tmp_path_factory.mktemp("folder"))
+    reply = ask(desk, line)
+    assert reply["ok"] is False
+    assert reply["error"]
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.dictionaries(st.sampled_from([*FLASH, "key", "other"]), values, max_size=3))
+def test_any_request_is_obeyed_or_refused_and_only_obeyed_ones_leave_a_file(tmp_path_factory, change):
+    folder = tmp_path_factory.mktemp("folder")
+    reply = ask(make_desk(folder), {**FLASH, **change})
+    assert bool(files(folder)) == (reply["ok"] and "waiting" not in reply)
+    for text in files(folder).values():
+        assert all(line.count(";") == 3 and line.startswith("FLASH;") for line in text.splitlines())
+
+
+def test_deep_nesting_and_long_numbers_are_noise_too(desk):
+    for line in (b"[" * 60_000, b'{"id": ' + b"9" * 60_000 + b"}", b'{"method": ' + b"[" * 900 + b"]" * 900 + b"}"):
+        assert ask(desk, line)["ok"] is False
+
+
+# ---- templates -------------------------------------------------------------------------------------------------------
+
+
+def test_the_instruction_file_follows_the_template(tmp_path):
+    outbox = Outbox(tmp_path, "LED {label} t={duration:03d} s={strength:.0%}")
+    outbox.open()
+    desk = Gateway(outbox, None)
+    assert ask(desk, {"method": "flash", "labels": ["A1"], "duration": 7}) == {"id": None, "ok": True}
+    assert files(tmp_path) == {"robotd-000000000001.txt": "LED A1 t=007 s=100%\n"}
+    for label in ("A 1", "A=1"):
+        assert "which separates" in ask(desk, {"method": "flash", "labels": [label], "duration": 7})["error"]
+
+
+@pytest.mark.parametrize(
+    "template", ["FLASH", "{label.__class__}", "{}", "{label} {colour}", "{label", "{label:d}", "{label}\n{label}"]
+)
+def test_templates_that_make_no_line_are_refused(tmp_path, capsys, template):
+    with pytest.raises(SystemExit) as stop:
+        main(["--folder", str(tmp_path), "--template", template])
+    assert stop.value.code == 2
+    assert "--template" in capsys.readouterr().err
+
+
+# ---- crashes ---------------------------------------------------------------------------------------------------------
+
+
+def test_numbers_go_on_after_a_restart_also_when_the_files_are_gone(tmp_path):
+    ask(make_desk(tmp_path), FLASH)
+    (tmp_path / "robotd-000000000001.txt").unlink()
+    ask(make_desk(tmp_path), FLASH)
+    assert list(files(tmp_path)) == ["robotd-000000000002.txt"]
+    (tmp_path / ".robotd-labels" / "log").unlink()
+    ask(make_desk(tmp_path), FLASH)
+    assert list(files(tmp_path))[-1] == "robotd-000000000003.txt"
+
+
+def test_a_key_is_obeyed_once_also_over_a_restart(tmp_path):
+    desk = make_desk(tmp_path)
+    for key in ("a", "b", "a", "b"):
+        assert ask(desk, {**FLASH, "key": key}) == {"id": 1, "ok": True}
+    assert len(files(tmp_path)) == 2
+    assert ask(make_desk(tmp_path), {**FLASH, "key": "a"})["ok"]
+    assert len(files(tmp_path)) == 2
+
+
+class PowerCutError(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("step", range(8))
+def test_a_crash_at_any_step_neither_loses_nor_repeats_a_request(tmp_path, monkeypatch, step):
+    left = step
+
+    def cut(function):
+        def run(*args, **kwargs):
+            nonlocal left
+            if left == 0:
+                raise PowerCutError
+            left -= 1
+            return function(*args, **kwargs)
+
+        return run
+
+    monkeypatch.setattr(gateway, "_write", cut(gateway._write))
+    monkeypatch.setattr(os, "replace", cut(os.replace))
+    desk = make_desk(tmp_path)
+    told = []
+    try:
+        for key in ("a", "b"):
+            told.append(ask(desk, {**FLASH, "labels": [key], "key": key})["ok"])
+    except PowerCutError:
+        pass
+    left = 1000
+    desk = make_desk(tmp_path)
+    for key in ("a", "b"):  # whoever got no answer asks again, under the same key
+        assert ask(desk, {**FLASH, "labels": [key], "key": key})["ok"]
+    assert [text.split(";")[1] for text in files(tmp_path).values()] == ["a", "b"]
+    assert [path.name for path in (tmp_path / ".robotd-labels").iterdir()] == ["log"]
+
+
+def test_a_log_that_was_cut_off_is_read_up_to_the_cut(tmp_path):
+    ask(make_desk(tmp_path), {**FLASH, "key": "a"})
+    log = tmp_path / ".robotd-labels" / "log"
+    log.write_bytes(log.read_bytes() + log.read_bytes()[:30])
+    ask(make_desk(tmp_path), {**FLASH, "key": "b"})
+    for key in ("a", "b"):
+        ask(make_desk(tmp_path), {**FLASH, "key": key})
+    assert len(files(tmp_path)) == 2
+
+
+def test_the_log_says_who_asked_for_what_and_is_put_aside_when_long(tmp_path, monkeypatch):
+    monkeypatch.setattr(gateway, "LOG_LIMIT", 300)
+    desk = make_desk(tmp_path)
+    for number in range(5):
+        desk.answer(json.dumps({**FLASH, "key": str(number)}).encode(), "10.0.0.7")
+    work = tmp_path / ".robotd-labels"
+    assert sorted(path.name for path in work.iterdir()) == ["log", "log.1"]
+    entry = json.loads((work / "log").read_text().splitlines()[-1])
+    assert entry.pop("date") > 1.7e9
+    assert entry == {
+        "file": "robotd-000000000005.txt",
+        "key": "4",
+        "sender": "10.0.0.7",
+        "labels": ["A17", "B 2"],
+        "duration": 3,
+        "strength": 1.0,
+    }
+    assert ask(make_desk(tmp_path), {**FLASH, "key": "3"})["ok"]
+    assert len(files(tmp_path)) == 5
+
+
+# ---- the program -----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def program(folder, *arguments, port=0):
+    (folder / "token").write_text(TOKEN + "\n")
+    watched = folder / "watched"
+    watched.mkdir(exist_ok=True)
+    command = [
+        sys.executable,
+        gateway.__file__,
+        "--folder",
+        watched,
+        "--token-file",
+        folder / "token",
+        "--port",
+        str(port),
+    ]
+    with subprocess.Popen([*map(str, command), *arguments], stdout=subprocess.PIPE, text=True) as process:
+        line = process.stdout.readline()
+        assert line.startswith("robotd-labels: listening on 127.0.0.1:")
+        try:
+            yield SimpleNamespace(process=process, port=int(line.rsplit(":", 1)[1]), watched=watched)
+        finally:
+            process.kill()
+
+
+def test_the_file_runs_by_itself_on_the_standard_library(tmp_path):
+    alone = tmp_path / "robotd_labels.py"
+    shutil.copy(gateway.__file__, alone)
+    result = subprocess.run(
+        [sys.executable, "-I", "-S", str(alone), "--help"], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert "--token-file" in result.stdout
+
+
+def test_the_program_answers_through_noise_and_leaves_cleanly(tmp_path):
+    with program(tmp_path) as running:
+        good = json.dumps(FLASH).encode() + b"\n"
+        with socket.create_connection(("127.0.0.1", running.port), 10) as line, line.makefile("rb") as replies:
+            line.sendall(b"\x00\xff noise\n\n   \n" + good[:20])
+            assert not json.loads(replies.readline())["ok"]
+            line.sendall(good[20:] + good)
+            assert [json.loads(replies.readline())["ok"] for _ in range(2)] == [True, True]
+        with socket.create_connection(("127.0.0.1", running.port), 10) as line, line.makefile("rb") as replies:
+            line.sendall(b"x" * 200_000)
+            assert "a line of more than 65536 bytes" in json.loads(replies.readline())["error"]
+        with socket.create_connection(("127.0.0.1", running.port), 10) as line:
+            line.sendall(good[:-10])  # and gone
+        lines = [socket.create_connection(("127.0.0.1", running.port), 10) for _ in range(32)]
+        with socket.create_connection(("127.0.0.1", running.port), 10) as line, line.makefile("rb") as replies:
+            assert "more than 32 connections" in json.loads(replies.readline())["error"]
+        lines[0].sendall(good)
+        assert json.loads(lines[0].recv(1000))["ok"]
+        running.process.send_signal(signal.SIGTERM)
+        assert running.process.wait(10) == 0
+        for line in lines:
+            line.close()
+    assert len(files(running.watched)) == 3
+
+
+def test_wrong_command_lines_are_explained(tmp_path, capsys):
+    assert main(["--folder", str(tmp_path / "gone")]) == 1
+    assert "gone" in capsys.readouterr().err
+    for arguments in (["--token-file", str(tmp_path / "no")], ["--host", "0.0.0.0"]):
+        with pytest.raises(SystemExit):
+            main(["--folder", str(tmp_path), *arguments])
+    assert "without --token-file only 127.0.0.1" in capsys.readouterr().err
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert main(["--folder", str(tmp_path), "--port", str(taken.getsockname()[1])]) == 1
+    assert "robotd-labels: 127.0.0.1 port" in capsys.readouterr().err
+
+
+# ---- the driver ------------------------------------------------------------------------------------------------------
+
+
+def make_driver(folder, port, **more):
+    config = bind(
+        PricerConfig, {"port": port, "token_file": str(folder / "token"), **more}, "robotd.toml [drivers.labels]"
+    )
+    return PricerDriver("labels", config, SimpleNamespace(), Bus(), SimpleNamespace())
+
+
+def test_the_driver_brings_flashes_to_the_folder_in_no_virtual_time(tmp_path):
+    with program(tmp_path) as running:
+
+        async def run():
+            driver = make_driver(tmp_path, running.port)
+            assert isinstance(driver, Labels)
+            await driver.open()
+            await driver.flash(["A1", "A2"], 1.0, 3.0)
+            await driver.flash([f"L{number}" for number in range(501)], 0.5, 4)
+            await driver.flash([], 1.0, 3)
+            assert now() == 0.0
+            await driver.close()
+            await driver.close()
+
+        run_virtual(run())
+        texts = list(files(running.watched).values())
+    assert texts[0] == "FLASH;A1;3;1.0\nFLASH;A2;3;1.0\n"
+    assert [text.count("\n") for text in texts] == [2, 500, 1]
+
+
+def test_the_driver_finds_a_restarted_gateway_and_repeats_nothing(tmp_path):
+    async def run():
+        with program(tmp_path) as first:
+            driver = make_driver(tmp_path, first.port)
+            await driver.open()
+            await driver.flash(["A1"], 1.0, 3)
+            first.process.kill()
+            first.process.wait()
+            with program(tmp_path, port=first.port) as second:
+                await driver.flash(["A2"], 1.0, 3)
+                assert [text[6:8] for text in files(second.watched).values()] == ["A1", "A2"]
+        watch = asyncio.create_task(driver.run())
+        with pytest.raises(DriverFault, match=r"labels: robotd-labels at 127.0.0.1:\d+ cannot be reached"):
+            await driver.flash(["A3"], 1.0, 3)
+        with pytest.raises(DriverFault, match="cannot be reached"):  # so that its supervisor opens it again
+            await watch
+        await driver.close()
+
+    run_virtual(run())
+
+
+def test_the_driver_says_why_a_request_was_refused(tmp_path):
+    with program(tmp_path) as running:
+
+        async def run():
+            driver = make_driver(tmp_path, running.port)
+            await driver.open()
+            with pytest.raises(
+                MissionError, match=r"labels: robotd-labels refuses: duration: found 0.5; expected whole"
+            ):
+                await driver.flash(["A1"], 1.0, 0.5)
+            await driver.flash(["A1"], 1.0, 1)
+            await driver.close()
+            (tmp_path / "token").write_text("old")
+            with pytest.raises(DriverFault, match="refuses: token: missing or wrong"):
+                await driver.open()
+            await driver.close()
+            (tmp_path / "token").unlink()
+            with pytest.raises(DriverFault, match=r"token_file .* cannot be read"):
+                await driver.open()
+
+        run_virtual(run())
+
+
+@contextmanager
+def impostor(*answers):
+    """Something else that listens: gives each connection one of these answers to its first line, then hangs up."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    script = (
+        "import socket, sys\n"
+        "listener = socket.socket(fileno=int(sys.argv[1]))\n"
+        "for answer in sys.argv[2:]:\n"
+        "    line, _ = listener.accept()\n"
+        "    line.recv(4096)\n"
+        "    if answer == 'hang': line.recv(1)\n"
+        "    line.sendall(answer.encode())\n"
+        "    line.close()\n"
+    )
+    command = [sys.executable, "-c", script, str(listener.fileno()), *answers]
+    with listener, subprocess.Popen(command, pass_fds=[listener.fileno()]) as process:
+        try:
+            yield port
+        finally:
+            process.kill()
+
+
+def test_the_driver_does_not_trust_whoever_listens(tmp_path):
+    (tmp_path / "token").write_text(TOKEN)
+
+    async def run():
+        for answer, text in (
+            ("HTTP/1.1 400 Bad Request\n", "does not answer like robotd-labels"),
+            ("[]\n", "does not answer like robotd-labels"),
+            ('{"id": 7, "ok": true}\n', "does not answer like robotd-labels"),
+            ("", "closed the connection"),
+            ('{"id": 1, "ok"', "closed the connection"),
+            ("x" * 100_000 + "\n", "does not answer like robotd-labels"),
+        ):
+            with impostor(answer) as port:
+                driver = make_driver(tmp_path, port)
+                with pytest.raises(DriverFault, match=text):
+                    await driver.open()
+                await driver.close()
+
+    run_virtual(run())
+
+
+def test_the_driver_gives_up_on_a_gateway_that_hangs(tmp_path):
+    (tmp_path / "token").write_text(TOKEN)
+
+    async def run():
+        with impostor("hang") as port:
+            driver = make_driver(tmp_path, port, timeout_s=0.1)
+            with pytest.raises(DriverFault, match=r"did not answer within 0.1 s"):
+                await driver.open()
+            await driver.close()
+
+    asyncio.run(run())
+
+
+def test_the_drivers_section_is_checked():
+    with pytest.raises(ConfigError) as caught:
+        bind(PricerConfig, {"host": "", "port": 0, "tokenfile": "x"}, "robotd.toml [drivers.labels]")
+    assert "found 0; expected 1 to 65535" in str(caught.value)
+    assert "did you mean 'token_file'?" in str(caught.value)
+    with pytest.raises(ConfigError, match="host = ''"):
+        bind(PricerConfig, {"host": "", "port": 1}, "robotd.toml [drivers.labels]")

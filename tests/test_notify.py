@@ -1,0 +1,76 @@
+"""systemd hears how the service fares, and nobody minds if there is no systemd."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import types
+
+import pytest
+
+from robotd.notify import notify, watchdog_s
+
+
+@pytest.fixture(params=["by hand", "systemd-python"])
+def sender(request, monkeypatch):
+    """Both ways; systemd-python is replaced by what its documentation says, so that the test needs no systemd."""
+    if request.param == "by hand":
+        monkeypatch.setitem(sys.modules, "systemd", None)
+        monkeypatch.setitem(sys.modules, "systemd.daemon", None)
+        return
+    package, daemon = types.ModuleType("systemd"), types.ModuleType("systemd.daemon")
+
+    def send(status: str) -> bool:
+        address = os.environ.get("NOTIFY_SOCKET")
+        if not address:
+            return False
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+            channel.sendto(status.encode(), address.replace("@", "\0"))
+        return True
+
+    daemon.notify = send
+    monkeypatch.setitem(sys.modules, "systemd", package)
+    monkeypatch.setitem(sys.modules, "systemd.daemon", daemon)
+
+
+@pytest.mark.usefixtures("sender")
+@pytest.mark.parametrize("abstract", [False, True])
+def test_the_state_arrives_as_one_datagram(tmp_path, monkeypatch, abstract):
+    name = f"@robotd-test-{os.getpid()}" if abstract else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(name.replace("@", "\0"))
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        assert notify("READY=1\nSTATUS=fährt zu Halt 3")
+        assert listener.recv(4096).decode() == "READY=1\nSTATUS=fährt zu Halt 3"
+
+
+@pytest.mark.usefixtures("sender")
+def test_nothing_happens_without_systemd(monkeypatch):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    assert not notify("READY=1")
+
+
+@pytest.mark.usefixtures("sender")
+def test_a_stale_socket_is_no_reason_to_die(tmp_path, monkeypatch):
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
+    assert not notify("WATCHDOG=1")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "gone"))
+    assert not notify("WATCHDOG=1")
+
+
+def test_the_watchdog_is_fed_three_times_per_period(monkeypatch):
+    monkeypatch.delenv("WATCHDOG_USEC", raising=False)
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    assert watchdog_s() is None
+    monkeypatch.setenv("WATCHDOG_USEC", "6000000")
+    assert watchdog_s() == 2.0
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+    assert watchdog_s() == 2.0
+    monkeypatch.setenv("WATCHDOG_PID", "1")
+    assert watchdog_s() is None
+    monkeypatch.delenv("WATCHDOG_PID")
+    for wrong in ("", "soon", "0"):
+        monkeypatch.setenv("WATCHDOG_USEC", wrong)
+        assert watchdog_s() is None
