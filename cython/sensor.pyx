@@ -1,0 +1,499 @@
+"""The image sensor of the simulated rig: ray casting, walkers, lights and noise.
+
+`robotd.sim.sensor` holds the numpy reference of every function here, with the meaning of the arguments.
+"""
+
+from libc.math cimport acos, asin, fabs, floor, sqrt
+from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, uint64_t
+from libc.stdlib cimport free, malloc
+
+cdef enum:
+    QUAD = 15  # numbers in a row of `quads`
+
+
+cdef inline double dot(const double* a, const double* b) noexcept nogil:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+cdef double sample(const uint16_t* texels, const int64_t* texture, double a, double b, double footprint) noexcept nogil:
+    """Bilinear value of the pyramid level that fits `footprint` (texels of level 0); a, b in 0..1."""
+    cdef int64_t offset = texture[0], w = texture[1], h = texture[2], level = 1
+    cdef int64_t x, y, x1, y1
+    cdef double fx, fy, top, bottom
+    while footprint > 1.5 and level < texture[3]:
+        offset += w * h
+        w = w // 2 if w > 1 else 1
+        h = h // 2 if h > 1 else 1
+        footprint *= 0.5
+        level += 1
+    fx = a * w - 0.5
+    fy = b * h - 0.5
+    fx = 0.0 if fx < 0.0 else (w - 1.0 if fx > w - 1.0 else fx)
+    fy = 0.0 if fy < 0.0 else (h - 1.0 if fy > h - 1.0 else fy)
+    x = <int64_t> fx
+    y = <int64_t> fy
+    x1 = x + 1 if x + 1 < w else x
+    y1 = y + 1 if y + 1 < h else y
+    fx -= x
+    fy -= y
+    top = texels[offset + y * w + x] * (1.0 - fx) + texels[offset + y * w + x1] * fx
+    bottom = texels[offset + y1 * w + x] * (1.0 - fx) + texels[offset + y1 * w + x1] * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+cdef int64_t nearest(
+    const double* quads, const int32_t* chosen, int64_t count, const double* o, const double* d, double* found
+) noexcept nogil:
+    """Index of the first quad hit from its front with found[0] > t > 0, or -1; found becomes t, a, b."""
+    cdef int64_t i, index, best = -1
+    cdef const double* q
+    cdef double slope, t, a, b, r0, r1, r2
+    for i in range(count):
+        index = chosen[i] if chosen != NULL else i
+        q = quads + index * QUAD
+        slope = q[9] * d[0] + q[10] * d[1] + q[11] * d[2]
+        if slope >= -1e-12:
+            continue
+        r0 = o[0] - q[0]
+        r1 = o[1] - q[1]
+        r2 = o[2] - q[2]
+        t = -(q[9] * r0 + q[10] * r1 + q[11] * r2) / slope
+        if t <= 1e-9 or t >= found[0]:
+            continue
+        r0 += t * d[0]
+        r1 += t * d[1]
+        r2 += t * d[2]
+        a = q[3] * r0 + q[4] * r1 + q[5] * r2
+        if a < 0.0 or a > q[12]:
+            continue
+        b = q[6] * r0 + q[7] * r1 + q[8] * r2
+        if b < 0.0 or b > q[13]:
+            continue
+        best = index
+        found[0] = t
+        found[1] = a
+        found[2] = b
+    return best
+
+
+cdef double radiance_along(
+    const double* quads, const int64_t* textures, const uint16_t* texels, const int32_t* chosen, int64_t count,
+    int64_t total, const double* o, const double* d, double spread, double empty, double* depth
+) noexcept nogil:
+    """Texel value seen along a ray, with one bounce in glass; `spread` is the ray's width per unit of t."""
+    cdef double found[3]
+    cdef double bounce[3]
+    cdef double start[3]
+    cdef double direction[3]
+    cdef double slope, length, value, footprint, reflected, travelled
+    cdef const double* q
+    cdef int64_t index, other
+    found[0] = 1e9
+    index = nearest(quads, chosen, count, o, d, found)
+    depth[0] = found[0]
+    if index < 0:
+        return empty
+    q = quads + index * QUAD
+    slope = -dot(q + 9, d)
+    length = sqrt(dot(d, d))
+    slope = slope / length
+    footprint = found[0] * spread / sqrt(slope if slope > 0.05 else 0.05)
+    value = sample(texels, textures + 4 * index, found[1] / q[12], found[2] / q[13],
+                   footprint * textures[4 * index + 1] / q[12])
+    if q[14] <= 0.0:
+        return value
+    slope = dot(q + 9, d)
+    for other in range(3):
+        start[other] = o[other] + found[0] * d[other]
+        direction[other] = d[other] - 2.0 * slope * q[9 + other]
+    travelled = found[0]
+    bounce[0] = 1e9
+    other = nearest(quads, NULL, total, start, direction, bounce)
+    if other < 0:
+        reflected = empty
+    else:
+        reflected = sample(texels, textures + 4 * other, bounce[1] / quads[other * QUAD + 12],
+                           bounce[2] / quads[other * QUAD + 13],
+                           (travelled + bounce[0]) * spread * textures[4 * other + 1] / quads[other * QUAD + 12])
+    return (1.0 - q[14]) * value + q[14] * reflected
+
+
+def trace(
+    const double[:, ::1] quads, const int64_t[:, ::1] textures, const uint16_t[::1] texels, double unit, double empty,
+    const double[:, ::1] T_store_camera, const float[:, :, ::1] rays, float[:, ::1] radiance, float[:, ::1] depth
+):
+    cdef int64_t height = radiance.shape[0], width = radiance.shape[1], total = quads.shape[0]
+    cdef int64_t r0, c0, r1, c1, r, c, i, count, k
+    cdef double o[3]
+    cdef double d[3]
+    cdef double axis[3]
+    cdef double corner[3]
+    cdef double x, y, a, b, value, z, first, cosine, half, angle, distance, radius, spread
+    cdef const double* q = &quads[0, 0]
+    cdef int32_t* chosen = <int32_t*> malloc(total * sizeof(int32_t))
+    cdef int32_t* facing = <int32_t*> malloc(total * sizeof(int32_t))
+    cdef int64_t n_facing = 0
+    if chosen == NULL or facing == NULL:
+        free(chosen)
+        free(facing)
+        raise MemoryError
+    with nogil:
+        for k in range(3):
+            o[k] = T_store_camera[k, 3]
+        for i in range(total):  # quads are seen from the front only
+            if (o[0] - q[QUAD * i]) * q[QUAD * i + 9] + (o[1] - q[QUAD * i + 1]) * q[QUAD * i + 10] \
+                    + (o[2] - q[QUAD * i + 2]) * q[QUAD * i + 11] > 0.0:
+                facing[n_facing] = <int32_t> i
+                n_facing += 1
+        # width of a sub-pixel's ray at unit depth
+        spread = 0.5 * fabs(rays[height // 2, width // 2 + 1, 0] - rays[height // 2, width // 2, 0])
+        for r0 in range(0, height, 32):
+            r1 = min(r0 + 32, height)
+            for c0 in range(0, width, 32):
+                c1 = min(c0 + 32, width)
+                direction(T_store_camera, rays[(r0 + r1) // 2, (c0 + c1) // 2, 0],
+                          rays[(r0 + r1) // 2, (c0 + c1) // 2, 1], axis)
+                unit_length(axis)
+                cosine = 1.0
+                for i in range(4):
+                    r = r0 if i < 2 else r1
+                    c = c0 if i % 2 == 0 else c1
+                    direction(T_store_camera, rays[r, c, 0], rays[r, c, 1], corner)
+                    unit_length(corner)
+                    cosine = min(cosine, dot(axis, corner))
+                half = acos(max(cosine, -1.0)) * 1.05 + 0.002
+                count = 0
+                for k in range(n_facing):  # keep the quads whose bounding sphere meets the tile's cone
+                    i = facing[k]
+                    for r in range(3):
+                        corner[r] = q[QUAD * i + r] - o[r] + 0.5 * (
+                            q[QUAD * i + 12] * q[QUAD * i + 3 + r] + q[QUAD * i + 13] * q[QUAD * i + 6 + r])
+                    radius = 0.5 * sqrt(q[QUAD * i + 12] * q[QUAD * i + 12] + q[QUAD * i + 13] * q[QUAD * i + 13])
+                    distance = sqrt(dot(corner, corner))
+                    if distance > radius:
+                        angle = acos(max(-1.0, min(1.0, dot(axis, corner) / distance)))
+                        if angle > half + asin(radius / distance):
+                            continue
+                    chosen[count] = <int32_t> i
+                    count += 1
+                for r in range(r0, r1):
+                    for c in range(c0, c1):
+                        value = 0.0
+                        first = 1e9
+                        for i in range(4):
+                            a = 0.25 if i % 2 == 0 else 0.75
+                            b = 0.25 if i < 2 else 0.75
+                            x = (1 - b) * ((1 - a) * rays[r, c, 0] + a * rays[r, c + 1, 0]) \
+                                + b * ((1 - a) * rays[r + 1, c, 0] + a * rays[r + 1, c + 1, 0])
+                            y = (1 - b) * ((1 - a) * rays[r, c, 1] + a * rays[r, c + 1, 1]) \
+                                + b * ((1 - a) * rays[r + 1, c, 1] + a * rays[r + 1, c + 1, 1])
+                            direction(T_store_camera, x, y, d)
+                            value += radiance_along(q, &textures[0, 0], &texels[0], chosen, count, total, o, d,
+                                                    spread, empty / unit, &z)
+                            first = min(first, z)
+                        radiance[r, c] = <float> (0.25 * value * unit)
+                        depth[r, c] = <float> first
+    free(chosen)
+    free(facing)
+
+
+cdef inline void direction(const double[:, ::1] T, double x, double y, double* d) noexcept nogil:
+    d[0] = T[0, 0] * x + T[0, 1] * y + T[0, 2]
+    d[1] = T[1, 0] * x + T[1, 1] * y + T[1, 2]
+    d[2] = T[2, 0] * x + T[2, 1] * y + T[2, 2]
+
+
+cdef inline void unit_length(double* d) noexcept nogil:
+    cdef double length = sqrt(dot(d, d))
+    d[0] /= length
+    d[1] /= length
+    d[2] /= length
+
+
+def visible(const double[:, ::1] quads, const double[:, ::1] origins, const double[:, ::1] targets, uint8_t[::1] out):
+    cdef int64_t i, k
+    cdef double d[3]
+    cdef double o[3]
+    cdef double found[3]
+    cdef double length
+    with nogil:
+        for i in range(origins.shape[0]):
+            for k in range(3):
+                d[k] = targets[i, k] - origins[i, k]
+            length = sqrt(dot(d, d))
+            out[i] = 1
+            if length <= 0.002:
+                continue
+            for k in range(3):  # both ends may lie on a surface
+                d[k] /= length
+                o[k] = origins[i, k] + 0.001 * d[k]
+            found[0] = length - 0.002
+            out[i] = nearest(&quads[0, 0], NULL, quads.shape[0], o, d, found) < 0
+
+
+cdef struct Board:  # a walker as seen from one point: an upright picture that faces that point
+    double nx, ny, ex, ey, distance, drift, height, half, light
+    int64_t picture
+    bint mirrored
+
+
+cdef bint face(const double* w, double ox, double oy, Board* board) noexcept nogil:
+    cdef double dx = w[0] - ox, dy = w[1] - oy, speed = sqrt(w[2] * w[2] + w[3] * w[3]), side
+    board.distance = sqrt(dx * dx + dy * dy)
+    if board.distance < 0.15:
+        return False
+    board.nx = dx / board.distance
+    board.ny = dy / board.distance
+    board.ex = board.ny  # to the right, seen from the viewer
+    board.ey = -board.nx
+    board.drift = w[2] * board.ex + w[3] * board.ey
+    side = fabs(board.drift) / speed if speed > 1e-9 else 0.0
+    board.picture = <int64_t> w[6] * 3 + (0 if side < 0.35 else (1 if side < 0.8 else 2))
+    board.mirrored = board.drift < 0.0
+    board.height = w[4]
+    board.half = w[8]
+    board.light = w[5]
+    return True
+
+
+cdef inline float texel_at(
+    const uint8_t* picture, int64_t w, int64_t h, float fx, float fy, float* light
+) noexcept nogil:
+    """Coverage at a place of a picture, 0..255, and there its reflectance."""
+    cdef int64_t x, y
+    cdef const uint8_t* p
+    cdef const uint8_t* q
+    cdef float top, bottom
+    if not (fx >= 0.0 and fy >= 0.0 and fx < w - 1 and fy < h - 1):
+        return 0.0
+    x = <int64_t> fx
+    y = <int64_t> fy
+    p = picture + 2 * (y * w + x)
+    q = p + 2 * w
+    if not (p[0] | p[2] | q[0] | q[2]):
+        return 0.0
+    fx -= x
+    fy -= y
+    top = p[1] + fx * (p[3] - p[1])
+    bottom = q[1] + fx * (q[3] - q[1])
+    light[0] = top + fy * (bottom - top)
+    top = p[0] + fx * (p[2] - p[0])
+    bottom = q[0] + fx * (q[2] - q[0])
+    return top + fy * (bottom - top)
+
+
+cdef bint paint_tile(
+    float[:, ::1] linear, const float[:, ::1] depth, const uint8_t* picture, int64_t w, int64_t h, const float* fx,
+    const float* fy, const float* t, float light, int64_t r0, int64_t r1, int64_t c0, int64_t c1, int32_t* box
+) noexcept nogil:
+    """Paint a walker into one tile, given places in the picture and depths at the tile's corners."""
+    cdef int64_t r, c, top = r1, bottom = r0, left = c1, right = c0
+    cdef float a, x, y, z, dx, dy, dz, alpha, tone
+    cdef float rows = 1.0 / <float> (r1 - r0), columns = 1.0 / <float> (c1 - c0)
+    for r in range(r0, r1):
+        a = (r - r0 + <float> 0.5) * rows
+        x = fx[0] + a * (fx[2] - fx[0])
+        y = fy[0] + a * (fy[2] - fy[0])
+        z = t[0] + a * (t[2] - t[0])
+        dx = (fx[1] + a * (fx[3] - fx[1]) - x) * columns
+        dy = (fy[1] + a * (fy[3] - fy[1]) - y) * columns
+        dz = (t[1] + a * (t[3] - t[1]) - z) * columns
+        for c in range(c0, c1):
+            a = c - c0 + <float> 0.5
+            alpha = texel_at(picture, w, h, x + a * dx, y + a * dy, &tone)
+            if alpha <= 0.0 or z + a * dz >= depth[r, c]:
+                continue
+            alpha = alpha / <float> 255.0
+            linear[r, c] += alpha * (tone * light - linear[r, c])
+            top = min(top, r)
+            bottom = r + 1
+            left = min(left, c)
+            right = max(right, c + 1)
+    box[0] = <int32_t> top
+    box[1] = <int32_t> bottom
+    box[2] = <int32_t> left
+    box[3] = <int32_t> right
+    return bottom > top
+
+
+def paint_walkers(
+    float[:, ::1] linear, const float[:, ::1] depth, const float[:, :, ::1] rays, const double[:, ::1] T_store_camera,
+    const double[:, ::1] walkers, const uint8_t[::1] sprites, const int64_t[:, ::1] levels, const double[:, ::1] spans,
+    double row_time, int32_t[:, ::1] boxes
+):
+    cdef int64_t height = linear.shape[0], width = linear.shape[1], used = 0
+    cdef int64_t k, r0, c0, r1, c1, r, c, i, level, picture, h, w, ahead
+    cdef double d[3]
+    cdef float fx[4]
+    cdef float fy[4]
+    cdef float depths[4]
+    cdef double ox = T_store_camera[0, 3], oy = T_store_camera[1, 3], oz = T_store_camera[2, 3]
+    cdef double reach, t, s, z, s0, s1, z0, z1, low, high, pixel
+    cdef Board board
+    with nogil:
+        for k in range(walkers.shape[0]):
+            if not face(&walkers[k, 0], ox, oy, &board):
+                continue
+            pixel = fabs(rays[height // 2, width // 2 + 1, 0] - rays[height // 2, width // 2, 0]) * board.distance
+            level = 0
+            while level + 1 < levels.shape[0] and pixel * levels[level, 1] > 1.5 * board.height:
+                level += 1
+            h = levels[level, 1]
+            w = levels[level, 2]
+            picture = <int64_t> walkers[k, 7] * levels[level, 3] + board.picture
+            low = -spans[picture, 1] if board.mirrored else spans[picture, 0]
+            high = -spans[picture, 0] if board.mirrored else spans[picture, 1]
+            picture = 2 * (levels[level, 0] + picture * h * w)
+            for r0 in range(0, height, 16):
+                r1 = min(r0 + 16, height)
+                for c0 in range(0, width, 16):
+                    c1 = min(c0 + 16, width)
+                    s0 = 1e9
+                    s1 = -1e9
+                    z0 = 1e9
+                    z1 = -1e9
+                    ahead = 0
+                    for i in range(4):
+                        r = r0 if i < 2 else r1
+                        c = c0 if i % 2 == 0 else c1
+                        direction(T_store_camera, rays[r, c, 0], rays[r, c, 1], d)
+                        reach = d[0] * board.nx + d[1] * board.ny
+                        if reach <= 0.02:
+                            break
+                        ahead += 1
+                        t = board.distance / reach
+                        s = (t * (d[0] * board.ex + d[1] * board.ey) - board.drift * row_time * r) / board.half
+                        z = (oz + t * d[2]) / board.height
+                        s0 = min(s0, s)
+                        s1 = max(s1, s)
+                        z0 = min(z0, z)
+                        z1 = max(z1, z)
+                        fx[i] = <float> ((0.5 - 0.5 * s if board.mirrored else 0.5 + 0.5 * s) * w - 0.5)
+                        fy[i] = <float> ((1.0 - z) * h - 0.5)
+                        depths[i] = <float> t
+                    if ahead < 4 or used >= boxes.shape[0] or s0 > high or s1 < low or z0 > 1.0 or z1 < 0.0:
+                        continue
+                    used += paint_tile(linear, depth, &sprites[picture], w, h, fx, fy, depths,
+                                       <float> (board.light / 255.0), r0, r1, c0, c1, &boxes[used, 0])
+    return used
+
+
+def transmission(
+    const double[:, ::1] origins, const double[:, ::1] targets, const double[::1] delays,
+    const double[:, ::1] walkers, const uint8_t[::1] sprites, const int64_t[:, ::1] levels, double[::1] out
+):
+    cdef int64_t i, k, picture
+    cdef double dx, dy, reach, t, s, z
+    cdef float light = 0.0
+    cdef Board board
+    with nogil:
+        for i in range(origins.shape[0]):
+            for k in range(walkers.shape[0]):
+                if not face(&walkers[k, 0], origins[i, 0], origins[i, 1], &board):
+                    continue
+                dx = targets[i, 0] - origins[i, 0]
+                dy = targets[i, 1] - origins[i, 1]
+                reach = dx * board.nx + dy * board.ny
+                if reach <= board.distance:
+                    continue
+                t = board.distance / reach
+                s = (t * (dx * board.ex + dy * board.ey) - board.drift * delays[i]) / board.half
+                z = (origins[i, 2] + t * (targets[i, 2] - origins[i, 2])) / board.height
+                if board.mirrored:
+                    s = -s
+                picture = levels[0, 0] + (<int64_t> walkers[k, 7] * levels[0, 3] + board.picture) \
+                    * levels[0, 1] * levels[0, 2]
+                out[i] *= 1.0 - texel_at(&sprites[2 * picture], levels[0, 2], levels[0, 1],
+                                         <float> ((0.5 + 0.5 * s) * levels[0, 2] - 0.5),
+                                         <float> ((1.0 - z) * levels[0, 1] - 0.5), &light) / 255.0
+
+
+def add_lights(
+    float[:, ::1] linear, const int32_t[:, ::1] boxes, const float[:, ::1] across, const float[:, ::1] down,
+    const double[::1] top, const double[::1] bottom, const float[::1] gain
+):
+    cdef int64_t i, r, c, rows
+    cdef double strength
+    cdef float row
+    with nogil:
+        for i in range(boxes.shape[0]):
+            rows = boxes[i, 1] - boxes[i, 0]
+            for r in range(boxes[i, 0], boxes[i, 1]):
+                strength = top[i] + (bottom[i] - top[i]) * (r - boxes[i, 0]) / (rows - 1 if rows > 1 else 1)
+                row = <float> (strength * down[i, r - boxes[i, 0]] / gain[r])
+                for c in range(boxes[i, 2], boxes[i, 3]):
+                    linear[r, c] += row * across[i, c - boxes[i, 2]]
+
+
+cdef inline uint64_t start_of_row(uint64_t seed, uint64_t row, uint64_t mask) noexcept nogil:
+    """Where in the noise bank a row begins: splitmix64, Steele et al. 2014."""
+    cdef uint64_t z = seed + (row + 1) * <uint64_t> 0x9E3779B97F4A7C15
+    z = (z ^ (z >> 30)) * <uint64_t> 0xBF58476D1CE4E5B9
+    z = (z ^ (z >> 27)) * <uint64_t> 0x94D049BB133111EB
+    return (z ^ (z >> 31)) & mask
+
+
+cdef void expose_row(
+    const int16_t* level, const uint8_t* sigma, const int8_t* noise, uint8_t* out, int64_t width
+) noexcept nogil:
+    cdef int64_t c
+    cdef int16_t v
+    for c in range(width):
+        v = <int16_t> ((<int16_t> (<int16_t> sigma[c] * <int16_t> noise[c])) >> 4)
+        v = <int16_t> (v + level[c])
+        v = <int16_t> (<int16_t> (v + 32) >> 6)
+        v = v if v > 0 else 0
+        out[c] = <uint8_t> (v if v < 255 else 255)
+
+
+cdef void scale_row(const int16_t* level, int32_t gain, int16_t* out, int64_t width) noexcept nogil:
+    cdef int64_t c
+    cdef int32_t v
+    for c in range(width):
+        v = (<int32_t> level[c] * gain) >> 14
+        out[c] = <int16_t> (v if v < 24000 else 24000)
+
+
+def expose(
+    const int16_t[:, ::1] level, const uint8_t[:, ::1] sigma, const int32_t[::1] gain, const int8_t[::1] bank,
+    uint64_t mask, uint64_t seed, uint8_t[:, ::1] out
+):
+    cdef int64_t height = level.shape[0], width = level.shape[1], r
+    cdef const int16_t* row
+    cdef int16_t* scaled = <int16_t*> malloc(width * sizeof(int16_t))
+    if scaled == NULL:
+        raise MemoryError
+    with nogil:
+        for r in range(height):
+            row = &level[r, 0]
+            if gain[r] != 16384:
+                scale_row(row, gain[r], scaled, width)
+                row = scaled
+            expose_row(row, &sigma[r, 0], &bank[start_of_row(seed, r, mask)], &out[r, 0], width)
+    free(scaled)
+
+
+def retouch(
+    float[:, ::1] linear, const float[:, ::1] still, const int32_t[:, ::1] boxes, const int16_t[::1] level_of,
+    const uint8_t[::1] sigma_of, double scale, const float[::1] gain, const int8_t[::1] bank, uint64_t mask,
+    uint64_t seed, uint8_t[:, ::1] out
+):
+    cdef int64_t last = level_of.shape[0] - 1, i, r, c
+    cdef const int8_t* noise
+    cdef float factor, value
+    cdef int32_t entry, v
+    with nogil:
+        for i in range(boxes.shape[0]):
+            for r in range(boxes[i, 0], boxes[i, 1]):
+                noise = &bank[start_of_row(seed, r, mask)]
+                factor = <float> (scale * gain[r])
+                for c in range(boxes[i, 2], boxes[i, 3]):
+                    value = linear[r, c] * factor
+                    entry = <int32_t> (value if value < last else last)
+                    v = level_of[entry] + ((<int32_t> sigma_of[entry] * noise[c]) >> 4)
+                    v = (v + 32) >> 6
+                    out[r, c] = <uint8_t> (0 if v < 0 else (255 if v > 255 else v))
+        for i in range(boxes.shape[0]):
+            for r in range(boxes[i, 0], boxes[i, 1]):
+                for c in range(boxes[i, 2], boxes[i, 3]):
+                    linear[r, c] = still[r, c]

@@ -1,0 +1,190 @@
+"""The simulated world: everything that is true, and what a calibration of it would leave the robot to believe."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ..config import Calibration
+from ..geometry.transforms import rotation_matrix, rotation_vector
+from ..odometry import Wheels
+from ..records import CameraModel, Floats, Pose, Priors, Transform, Vector3
+from .body import Body
+from .labels import LabelSystem
+from .layout import StoreLayout
+from .roomba import RoombaQuirks, SimRoomba
+from .scene import Scene
+from .settings import WorldSettings, load_settings
+
+__all__ = ["FLOOR", "RIG", "World", "WorldSettings", "load_settings"]
+
+RIG = {"front": 0.0, "left": math.pi / 2, "rear": math.pi, "right": -math.pi / 2}  # name to heading of each rig camera
+RIG_HEIGHT, RIG_RADIUS = 0.50, 0.06  # m
+RIG_LENS = (-0.06, 0.012, 0.0002, 0.0002, -0.001)
+FLOOR = "floor"
+FLOOR_POSITION, FLOOR_PITCH = (0.12, 0.0, 0.30), math.radians(35)
+FLOOR_LENS = (-0.05, 0.010, 0.0002, -0.0002, 0.0)
+LENS_SPREAD = 0.03  # by which lenses of one make differ, relative, one sigma
+
+
+class World:
+    """One store with one robot in it.
+
+    Parameters
+    ----------
+    layout : StoreLayout
+    settings : WorldSettings
+    seed : int
+        Decides everything that is random; equal seeds give equal bytes and pixels.
+    folder : Path
+        Which the label system watches for instruction files.
+
+    Attributes
+    ----------
+    line : LineGeometry
+        The tape's centre.
+    rig, floor_camera : tuple of CameraModel, CameraModel
+        The cameras as they truly are.
+    body : Body
+    roomba : SimRoomba
+    scene : Scene
+    label_system : LabelSystem
+    unplugged : set of str
+        Devices that are not there; see `unplug`.
+    """
+
+    def __init__(
+        self,
+        layout: StoreLayout,
+        settings: WorldSettings,
+        seed: int,
+        folder: Path,
+        *,
+        quirks: RoombaQuirks | None = None,
+    ) -> None:
+        self.layout = layout
+        self.settings = settings
+        self.seed = seed
+        self.line = layout.geometry
+        self.rig = tuple(self._rig_camera(name, heading) for name, heading in RIG.items())
+        self.floor_camera = self._floor_camera()
+        x, y = self.line.point_at(layout.line.stops[0])
+        start = Pose(float(x), float(y), float(self.line.heading_at(layout.line.stops[0])))
+        self.body = Body(layout, settings, self.rng("body"), start)
+        self.roomba = SimRoomba(self.body, self.rng("roomba"), quirks)
+        self.scene = Scene(layout, seed)
+        ids = tuple(label.id for label in layout.labels)
+        self.label_system = LabelSystem(ids, settings.labels, folder, self.rng("labels"))
+        self.unplugged: set[str] = set()
+        self._plugs: dict[str, Callable[[], None]] = {}
+
+    def rng(self, name: str) -> np.random.Generator:
+        """A random generator of its own for each name, so that no part's draws depend on another's."""
+        return np.random.default_rng([self.seed, zlib.crc32(name.encode())])
+
+    async def run(self) -> None:
+        """Let the world's own clockwork (the label system) run until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.label_system.run())
+
+    def lit(self, t0: Floats, t1: Floats) -> Floats:
+        """(..., L) light of every label, averaged over intervals (..., L) between two times in seconds."""
+        rows = [self.label_system.lit(a, b) for a, b in zip(*(np.atleast_2d(t) for t in (t0, t1)), strict=True)]
+        return np.asarray(np.reshape(rows, np.shape(t0)))
+
+    def camera_offset(self, name: str) -> float:
+        """Constant error of a camera's time stamps in seconds, unknown to the robot."""
+        limit = self.settings.camera_offset
+        return float(self.rng(f"offset/{name}").uniform(-limit, limit))
+
+    def believed_calibration(self) -> Calibration:
+        """What the robot knows after a calibration: the truth with the errors that a calibration leaves.
+
+        Wheels are believed nominal; their true scale and base are off by what remains after calibrating. The sigmas
+        of these errors are the priors.
+        """
+        s = self.settings
+        return Calibration(
+            wheels=Wheels(1.0, 1.0, s.wheel_base, s.travel_noise),
+            cameras=tuple(self._believed(camera) for camera in self.rig),
+            floor_camera=self._believed(self.floor_camera),
+            gamma=s.sensor.gamma,
+            row_time_s=s.sensor.readout / self.rig[0].size[1],
+            priors=Priors(
+                tilt_rad=s.tilt,
+                camera_rotation_rad=s.camera_rotation_error,
+                camera_translation_m=s.camera_translation_error,
+                focal_px=s.focal_error,
+                centre_px=s.centre_error,
+                odometry_scale=s.wheel_scale_error,
+                odometry_turn=math.hypot(s.wheel_scale_error, s.wheel_base_error),
+            ),
+        )
+
+    def unplug(self, device: str) -> None:
+        """Pull out a device: whoever has it open gets a DriverFault, and so does who opens it."""
+        self.unplugged.add(device)
+        release = self._plugs.pop(device, None)
+        if release is not None:
+            release()
+
+    def plug(self, device: str) -> None:
+        """Put a device back; it can be opened again."""
+        self.unplugged.discard(device)
+
+    def on_unplug(self, device: str, release: Callable[[], None]) -> None:
+        """Have `release` called when the device is pulled out."""
+        self._plugs[device] = release
+
+    def _believed(self, camera: CameraModel) -> CameraModel:
+        s, rng = self.settings, self.rng(f"calibration/{camera.name}")
+        turn = rotation_matrix(s.camera_rotation_error * rng.standard_normal(3))
+        shift = s.camera_translation_error * rng.standard_normal(3)
+        fx, fy = np.array(camera.matrix[:2]) + s.focal_error * rng.standard_normal(2)
+        cx, cy = np.array(camera.matrix[2:]) + s.centre_error * rng.standard_normal(2)
+        mount = camera.T_robot_camera
+        return CameraModel(
+            camera.name,
+            camera.size,
+            (float(fx), float(fy), float(cx), float(cy)),
+            Transform(
+                _vector3(rotation_vector(turn @ rotation_matrix(mount.rotation))),
+                _vector3(np.array(mount.translation) + shift),
+            ),
+            camera.model,
+            camera.distortion,
+            camera.valid_radius_px,
+        )
+
+    def _rig_camera(self, name: str, heading: float) -> CameraModel:
+        position = (RIG_RADIUS * math.cos(heading), RIG_RADIUS * math.sin(heading), RIG_HEIGHT)
+        mount = Transform(_vector3(rotation_vector(looking(heading, 0.0))), position)
+        return CameraModel(
+            name, (640, 480), (268.5, 268.5, 319.5, 239.5), mount, "brown-conrady", self._lens(name, RIG_LENS)
+        )
+
+    def _floor_camera(self) -> CameraModel:
+        mount = Transform(_vector3(rotation_vector(looking(0.0, FLOOR_PITCH))), FLOOR_POSITION)
+        lens = self._lens(FLOOR, FLOOR_LENS)
+        return CameraModel(FLOOR, (320, 240), (228.5, 228.5, 159.5, 119.5), mount, "brown-conrady", lens)
+
+    def _lens(self, name: str, lens: tuple[float, ...]) -> tuple[float, ...]:
+        spread = 1.0 + LENS_SPREAD * self.rng(f"lens/{name}").standard_normal()
+        return tuple(float(spread * coefficient) for coefficient in lens)
+
+
+def looking(heading: float, pitch: float) -> Floats:
+    """(3, 3) R_robot_camera of a camera that looks along `heading`, tipped down by `pitch` radians."""
+    c, s = math.cos(heading), math.sin(heading)
+    forward = np.array([c * math.cos(pitch), s * math.cos(pitch), -math.sin(pitch)])
+    right = np.array([s, -c, 0.0])
+    return np.column_stack([right, np.cross(forward, right), forward])
+
+
+def _vector3(values: Floats) -> Vector3:
+    return float(values[0]), float(values[1]), float(values[2])
