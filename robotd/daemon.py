@@ -1,0 +1,376 @@
+"""The daemon: binds the configuration to drivers, supervises them, runs the control loop and the mission.
+
+`assemble` opens nothing: it names every mistake of configuration and calibration. `Daemon.run` opens the drivers,
+keeps each one alive (halt, report, reopen with back-off), turns sensor frames into odometry and drive commands into
+safe motion, and runs at most one mission.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, cast
+
+from .bind import bind
+from .bus import Bus
+from .clock import in_thread, now, ticks
+from .config import Calibration, Config, collect, load_calibration, load_config
+from .errors import ConfigError, DriverFault, UploadError
+from .files import map_to_json
+from .hardware import Hardware
+from .journal import Journal
+from .mission import Health, Mission, complete_map
+from .notify import notify, watchdog_s
+from .odometry import Odometry
+from .plugin import Base, Camera, Driver, Follower, Labels, load
+from .records import Event, Map
+from .safety import SafetyGate
+from .upload import Uploader
+
+log = logging.getLogger("robotd")
+
+FIRST_RETRY_S, LAST_RETRY_S = 0.5, 30.0
+WATCH_S = 0.020  # the control loop's own tick, for when sensor frames stop coming
+TRAIL_S = 0.1
+LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """What a configuration describes; nothing in it has been opened."""
+
+    path: Path
+    config: Config
+    calibration: Calibration
+    bus: Bus
+    hardware: Hardware
+    base: Driver
+    follower: Driver
+    labels: Driver
+    cameras: Mapping[str, Driver]  # the rig's, in the calibration's order
+    eye: Driver  # the follower's camera
+
+    @property
+    def drivers(self) -> list[Driver]:
+        """In the order in which they are opened."""
+        return list(dict.fromkeys([self.base, *self.cameras.values(), self.eye, self.labels, self.follower]))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One driver of a configuration: its class and its bound section."""
+
+    name: str
+    cls: type[Driver]
+    config: Any
+
+
+def plan_drivers(path: Path, config: Config) -> dict[str, Plan]:
+    """Bind every driver's section; relative paths in it are relative to the configuration's folder.
+
+    Raises
+    ------
+    ConfigError
+        Lists every mistake of the sections, and a base, follower, labels or floor camera that is missing.
+    """
+    problems: list[str] = []
+    plans: dict[str, Plan] = {}
+    for name, section in config.drivers.items():
+        where = f"{path} [drivers.{name}]"
+        plan = collect(problems, lambda name=name, section=section, where=where: _plan(path, name, section, where))  # type: ignore[misc]
+        if plan is not None:
+            plans[name] = plan
+    if not problems:
+        for kind in ("base", "follower", "labels"):
+            names = _of_kind(plans, kind)
+            if len(names) != 1:
+                found = " and ".join(names) or "none"
+                problems.append(f"{path} [drivers]: found {found} of kind '{kind}'; expected exactly one")
+        for name in _of_kind(plans, "follower"):
+            eye = str(plans[name].config.camera)
+            if eye not in _of_kind(plans, "camera"):
+                problems.append(f"{path} [drivers.{name}] camera: there is no camera [drivers.{eye}]")
+    if problems:
+        raise ConfigError(*problems)
+    return plans
+
+
+def _plan(path: Path, name: str, section: Mapping[str, Any], where: str) -> Plan:
+    cls = load(str(section["driver"]), where)
+    config = bind(cls.Config, {key: value for key, value in section.items() if key != "driver"}, where)
+    resolved = {
+        item.name: path.parent / value
+        for item in fields(config)
+        if isinstance(value := getattr(config, item.name), Path)
+    }
+    return Plan(name, cls, replace(config, **resolved))
+
+
+def _of_kind(plans: Mapping[str, Plan], kind: str) -> list[str]:
+    return [name for name, plan in plans.items() if plan.cls.kind == kind]
+
+
+def assemble(path: Path, hardware: Hardware) -> Assembly:
+    """Build every driver of a configuration without opening any.
+
+    Parameters
+    ----------
+    path : Path
+        robotd.toml; relative paths in it are relative to its folder.
+    hardware : Hardware
+        Handed to the drivers.
+
+    Raises
+    ------
+    ConfigError
+        Lists every mistake of the configuration, of its drivers' sections and of the calibration.
+    """
+    config = load_config(path)
+    problems: list[str] = []
+    plans = collect(problems, lambda: plan_drivers(path, config)) or {}
+    calibration = collect(problems, lambda: load_calibration(path.parent / config.robot.calibration)) or Calibration()
+    if not problems:
+        cameras = _of_kind(plans, "camera")
+        problems += [
+            f"{path}: the calibration knows the camera '{camera.name}', but there is no camera [drivers.{camera.name}]"
+            for camera in calibration.cameras
+            if camera.name not in cameras
+        ]
+    bus = Bus()
+    drivers: dict[str, Driver] = {}
+    for name, plan in plans.items() if not problems else ():
+        driver = collect(
+            problems,
+            lambda name=name, plan=plan: plan.cls(name, plan.config, hardware, bus, calibration),  # type: ignore[misc]
+        )
+        if driver is not None:
+            drivers[name] = driver
+    if problems:
+        raise ConfigError(*problems)
+    base, follower, labels = (drivers[_of_kind(plans, kind)[0]] for kind in ("base", "follower", "labels"))
+    rig = {camera.name: drivers[camera.name] for camera in calibration.cameras}
+    eye = drivers[str(plans[follower.name].config.camera)]
+    return Assembly(path, config, calibration, bus, hardware, base, follower, labels, rig, eye)
+
+
+class Supervisor:
+    """Keeps one driver open: a DriverFault closes it, is reported, and it is opened again with growing back-off."""
+
+    def __init__(self, driver: Driver) -> None:
+        self.driver = driver
+        self.fault: str | None = f"{driver.name}: not opened yet"
+        self.restarts = 0
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        delay = FIRST_RETRY_S
+        while True:
+            opened: float | None = None
+            try:
+                await self.driver.open()
+                self.fault = None
+                opened = now()
+                await self.driver.run()
+                raise DriverFault(f"{self.driver.name}: stopped by itself")
+            except DriverFault as fault:
+                text = str(fault)
+                self.fault = text if text.startswith(f"{self.driver.name}:") else f"{self.driver.name}: {text}"
+                self.driver.report(f"{self.fault}; trying again in {delay:g} s", "error")
+            finally:
+                await self.driver.close()
+            if opened is not None and now() - opened > 10 * LAST_RETRY_S:
+                delay = FIRST_RETRY_S
+            await asyncio.sleep(delay)
+            delay = min(2 * delay, LAST_RETRY_S)
+            self.restarts += 1
+
+
+class ControlLoop:
+    """Sensor frames in, odometry and safe motion out; ticks by itself when sensor frames stop coming."""
+
+    def __init__(self, bus: Bus, base: Base, odometry: Odometry, gate: SafetyGate) -> None:
+        self.bus = bus
+        self.base = base
+        self.odometry = odometry
+        self.gate = gate
+        self.cause: str | None = "starting"
+        self._last = 0.0
+        self._command: object = None
+        self._watchdog = watchdog_s()
+        self._fed = -float("inf")
+
+    async def run(self) -> None:
+        """Until cancelled; the base is halted on the way out."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._follow_sensors())
+                group.create_task(self._watch())
+        finally:
+            self.base.halt()
+
+    async def _follow_sensors(self) -> None:
+        with self.bus.sensors.subscribe(size=16) as sensors:
+            async for frame in sensors:
+                self.gate.sensors(frame)
+                self.bus.odometry.publish(self.odometry.update(frame.t, frame.left, frame.right))
+                self._steer()
+
+    async def _watch(self) -> None:
+        async for _ in ticks(WATCH_S):
+            if now() - self._last >= WATCH_S:
+                self._steer()
+
+    def _steer(self) -> None:
+        self._last = now()
+        command = self.bus.commands.latest
+        if command is not None and command is not self._command:
+            self._command = command
+            self.gate.command(command)
+        motion = self.gate.output(self._last)
+        if motion.cause is not None and motion.cause != self.cause and self.cause is None:
+            self.base.halt()
+        else:
+            self.base.drive(motion.speed, motion.turn_rate)
+        self.cause = motion.cause
+        if self._watchdog is not None and self._last - self._fed >= self._watchdog:
+            self._fed = self._last  # fed here and nowhere else: a stuck control loop must be noticed
+            notify("WATCHDOG=1")
+
+
+class Daemon:
+    """One robot, running.
+
+    Attributes
+    ----------
+    map : Map or None
+        After a mission: the server's map, completed with the labels that were never seen.
+    """
+
+    def __init__(self, assembly: Assembly) -> None:
+        self.assembly = assembly
+        self.map: Map | None = None
+        self.mission: Mission | None = None
+        config, bus = assembly.config, assembly.bus
+        self.odometry = Odometry(assembly.calibration.wheels)
+        self.control = ControlLoop(bus, cast(Base, assembly.base), self.odometry, SafetyGate(config.safety))
+        self.supervisors = [Supervisor(driver) for driver in assembly.drivers]
+
+    async def run(self, *, mission: bool) -> None:
+        """Until cancelled, or with `mission` until that one has ended and its stops are uploaded."""
+        assembly, config = self.assembly, self.assembly.config
+        state = assembly.path.parent / config.robot.state_directory
+        journal = await in_thread(Journal.open, state / "journal.sqlite")
+        try:
+            hardware = assembly.hardware
+            synchronised = hardware.is_synchronised()
+            await in_thread(journal.note_clock, hardware.boot_id(), now(), hardware.utc(), synchronised=synchronised)
+            uploader = self._uploader(journal)
+            async with asyncio.TaskGroup() as group:
+                work = [
+                    self._log_events(journal),
+                    self._keep_trail(journal),
+                    self.control.run(),
+                    *(supervisor.run() for supervisor in self.supervisors),
+                ]
+                if uploader is not None:
+                    work.append(uploader.run())
+                tasks = [group.create_task(item) for item in work]
+                notify("READY=1\nSTATUS=ready")
+                if mission:
+                    await self._run_mission(journal, uploader, state)
+                    for task in tasks:
+                        task.cancel()
+        finally:
+            notify("STOPPING=1")
+            await in_thread(journal.close)
+
+    def _uploader(self, journal: Journal) -> Uploader | None:
+        upload = self.assembly.config.upload
+        if upload.url is None:
+            return None
+        token = None
+        if upload.token_file is not None:
+            path = self.assembly.path.parent / upload.token_file
+            try:
+                token = path.read_text().strip()
+            except OSError as error:
+                raise ConfigError(
+                    f"{self.assembly.path} upload.token_file: {path} cannot be read: {error.strerror}"
+                ) from error
+
+        def report(text: str, level: Any = "info") -> None:
+            self.assembly.bus.events.publish(Event(now(), "upload", level, text))
+
+        return Uploader(journal, upload.url, token, upload.retry_s, upload.timeout_s, report)
+
+    async def _run_mission(self, journal: Journal, uploader: Uploader | None, state: Path) -> None:
+        assembly, config = self.assembly, self.assembly.config
+        identify = replace(
+            config.mission.identify, gamma=assembly.calibration.gamma, row_time_s=assembly.calibration.row_time_s
+        )
+        self.mission = mission = Mission(
+            replace(config.mission, identify=identify),
+            assembly.calibration,
+            bus=assembly.bus,
+            hardware=assembly.hardware,
+            base=cast(Base, assembly.base),
+            follower=cast(Follower, assembly.follower),
+            labels=cast(Labels, assembly.labels),
+            cameras={name: cast(Camera, driver) for name, driver in assembly.cameras.items()},
+            eye=cast(Camera, assembly.eye),
+            odometry=self.odometry,
+            journal=journal,
+            health=Health(self._fault, lambda: self.control.cause),
+            wake_upload=uploader.wake if uploader is not None else lambda: None,
+        )
+        await mission.run()
+        if uploader is not None:
+            await self._fetch_map(mission, uploader, state)
+        assembly.bus.status.publish(
+            replace(assembly.bus.status.latest, t=now(), state="done") if assembly.bus.status.latest else None  # type: ignore[arg-type]
+        )
+
+    async def _fetch_map(self, mission: Mission, uploader: Uploader, state: Path) -> None:
+        config = self.assembly.config
+        try:
+            async with asyncio.timeout(config.mission.upload_wait_s):
+                await uploader.wait_empty()
+            solved = await uploader.fetch_map(config.mission.survey)
+        except (TimeoutError, UploadError) as error:
+            text = str(error) or f"the server did not take every stop within {config.mission.upload_wait_s:g} s"
+            self.assembly.bus.events.publish(
+                Event(now(), "upload", "error", f"no map yet: {text}; the stops are kept and sent at the next start")
+            )
+            return
+        self.map = complete_map(solved, config.mission.labels, len(mission.stops), mission.ended)
+        await in_thread(_write, state / "map.json", map_to_json(self.map))
+
+    def _fault(self) -> str | None:
+        return next((supervisor.fault for supervisor in self.supervisors if supervisor.fault is not None), None)
+
+    async def _log_events(self, journal: Journal) -> None:
+        with self.assembly.bus.events.subscribe(size=256) as events:
+            async for event in events:
+                log.log(LEVELS[event.level], "%s: %s", event.source, event.text)
+                await in_thread(journal.add_event, event)
+
+    async def _keep_trail(self, journal: Journal) -> None:
+        rows: list[tuple[float, float, float, float]] = []
+        last = None
+        async for tick in ticks(TRAIL_S):
+            state = self.assembly.bus.odometry.latest
+            if state is not None and state is not last and (last is None or state.pose != last.pose):
+                rows.append((state.t, state.pose.x, state.pose.y, state.pose.heading))
+                last = state
+            if rows and tick % 10 == 0:
+                await in_thread(journal.add_trail, rows)
+                rows = []
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_suffix(".part")
+    part.write_bytes(data)
+    part.replace(path)

@@ -1,0 +1,322 @@
+"""The mission: drive the line, stop, have the labels flash, record what the cameras saw, go on.
+
+    idle -> driving -> settling -> observing -> driving -> ... -> uploading -> done
+      any of them -> paused (a device failed; goes on when it works again) -> the state before
+      any of them -> fault (line lost, bumper, emergency stop, a device stays dead) -> uploading -> done
+
+Every finished stop is in the journal before the robot moves on. A mission that ends early keeps and uploads the
+stops it made, and the map says of each label without a position why it has none.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
+from dataclasses import replace
+from datetime import UTC
+from functools import partial
+from typing import Any, Literal, TypeVar
+
+from .bus import Bus, Subscription
+from .clock import in_executor, in_thread, now
+from .config import Calibration, MissionConfig
+from .errors import DriverFault, MissionError
+from .hardware import CameraMode, Hardware
+from .identify import Identifier, Slot
+from .journal import Journal
+from .odometry import Odometry
+from .plugin import Base, Camera, Follower, Labels
+from .records import Event, Frame, Map, MappedLabel, MissionStatus, Pose, Sighting, Stop, Survey
+
+T = TypeVar("T")
+State = Literal["idle", "driving", "settling", "observing", "uploading", "paused", "fault", "done"]
+
+OBSERVING = CameraMode(size=(640, 480), fps=30.0, exposure=0.010)  # a multiple of 10 ms: mains lamps do not flicker
+FIRST_FRAME_S = 5.0  # a camera that shows nothing for so long after its start is at fault
+STANDSTILL_M_S = 0.002
+FAULT_WAIT_S = 60.0
+HELD_S = 1.0  # wheels held by the safety layer for so long while driving end the mission
+
+
+class Health:
+    """What the mission asks of the daemon: are all devices well, and does anything stop the wheels?
+
+    `fault()` and `hazard()` return the reason in words, or None.
+    """
+
+    def __init__(self, fault: Callable[[], str | None], hazard: Callable[[], str | None]) -> None:
+        self.fault = fault
+        self.hazard = hazard
+
+
+class Mission:
+    """One run along the line.
+
+    Parameters
+    ----------
+    config, calibration
+        What to map (labels, stops) and with what (rig, priors).
+    base, follower, labels, cameras
+        The drivers; `cameras` holds the rig's by name, `eye` is the follower's camera.
+    odometry : Odometry
+        Dead reckoning since the start of the leg, kept up to date by the control loop.
+    wake_upload
+        Called after each record that waits to be uploaded.
+    """
+
+    def __init__(
+        self,
+        config: MissionConfig,
+        calibration: Calibration,
+        *,
+        bus: Bus,
+        hardware: Hardware,
+        base: Base,
+        follower: Follower,
+        labels: Labels,
+        cameras: Mapping[str, Camera],
+        eye: Camera,
+        odometry: Odometry,
+        journal: Journal,
+        health: Health,
+        wake_upload: Callable[[], None],
+    ) -> None:
+        self.config = config
+        self.calibration = calibration
+        self.bus = bus
+        self.hardware = hardware
+        self.base = base
+        self.follower = follower
+        self.labels = labels
+        self.cameras = dict(cameras)
+        self.eye = eye
+        self.odometry = odometry
+        self.journal = journal
+        self.health = health
+        self.wake_upload = wake_upload
+        self.leg = 1
+        self.stops: list[Stop] = []
+        self.ended: str | None = None  # why the mission ended early, in words
+        self._workers: ThreadPoolExecutor | None = None
+
+    async def run(self) -> None:
+        """Make every stop that can be made; afterwards `stops` and `ended` say what came of it."""
+        config = self.config
+        self._header = Survey(
+            survey=config.survey,
+            rig=self.calibration.rig,
+            stops=(),
+            created=self._utc(),
+            sigmas=self.calibration.sigmas,
+            priors=self.calibration.priors,
+            known_labels=config.known_labels,
+        )
+        self.leg = await in_thread(self.journal.begin_leg, self._header)
+        self.wake_upload()
+        with ThreadPoolExecutor(max_workers=max(1, len(self.cameras)), thread_name_prefix="blink") as self._workers:
+            try:
+                await self._ready()
+                for number, distance in enumerate(config.stops, 1):
+                    target = distance - config.stops[0]
+                    await self._through_faults("driving", number, partial(self._drive, target))
+                    await self._through_faults("settling", number, self._settle)
+                    sightings = await self._through_faults("observing", number, self._observe)
+                    await self._record(number, sightings)
+            except MissionError as error:
+                self.ended = str(error)
+                self.base.halt()
+                self._status("fault", len(self.stops) + 1, self.ended)
+                self.bus.events.publish(Event(now(), "mission", "error", self.ended))
+        self._status("uploading", len(self.stops))
+
+    # ---- the steps ---------------------------------------------------------------------------------------------------
+
+    async def _ready(self) -> None:
+        """Wait until every driver is open for the first time and the base talks."""
+        self._status("idle", 1)
+        deadline = now() + FAULT_WAIT_S
+        while (fault := self.health.fault()) is not None or self.bus.odometry.latest is None:
+            if now() > deadline:
+                raise MissionError(fault or f"{self.base.name}: no sensor frame for {FAULT_WAIT_S:g} s")
+            await asyncio.sleep(0.05)
+
+    async def _drive(self, target: float) -> None:
+        state = self.bus.odometry.latest
+        if state is not None and state.travelled >= target - 0.001:
+            return
+        await self.eye.start(CameraMode(size=self._eye_size(), fps=30.0, exposure=0.010))
+        try:
+            await self.follower.follow(target)
+        finally:
+            self.base.halt()
+            await self.eye.stop()
+
+    def _eye_size(self) -> tuple[int, int]:
+        camera = self.calibration.floor_camera
+        return camera.size if camera is not None else (320, 240)
+
+    async def _settle(self) -> None:
+        quiet = now()
+        while now() - quiet < self.config.settle_s:
+            await asyncio.sleep(0.05)
+            state = self.bus.odometry.latest
+            if state is None or abs(state.speed) > STANDSTILL_M_S or abs(state.turn_rate) > 10 * STANDSTILL_M_S:
+                quiet = now()
+
+    async def _observe(self) -> tuple[Sighting, ...]:
+        identifier = Identifier(self.config.labels, tuple(self.cameras), self.config.identify)
+        async with AsyncExitStack() as stack:
+            for name, camera in self.cameras.items():
+                frames = stack.enter_context(self.bus.frames(name).subscribe(size=8))
+                await camera.start(OBSERVING)
+                stack.push_async_callback(camera.stop)
+                async with asyncio.timeout(FIRST_FRAME_S) as limit:
+                    try:
+                        await frames.get()
+                    except TimeoutError:
+                        if limit.expired():
+                            raise DriverFault(f"{name}: no frame for {FIRST_FRAME_S:g} s; check the camera") from None
+                        raise
+                watch = asyncio.create_task(self._watch(identifier, name, frames))
+                stack.push_async_callback(_cancel, watch)
+            while (slot := identifier.next_slot()) is not None:
+                await self._slot(identifier, slot)
+        return await in_thread(identifier.finish)
+
+    async def _watch(self, identifier: Identifier, camera: str, frames: Subscription[Frame]) -> None:
+        async for frame in frames:
+            await in_executor(self._workers, identifier.update, camera, frame)
+
+    async def _slot(self, identifier: Identifier, slot: Slot) -> None:
+        started = now()
+        identifier.begin(slot, started)
+        for request in slot.requests:
+            await self.labels.flash(request.labels, 1.0, request.duration)
+        self._status("observing", len(self.stops) + 1, f"slot {slot.number + 1}")
+        while now() < started + slot.timeout and not identifier.is_complete(now()):
+            await asyncio.sleep(0.1)
+        await in_thread(
+            self.journal.add_slot, self.config.survey, self.leg, len(self.stops) + 1, slot.number, started, now()
+        )
+
+    async def _record(self, number: int, sightings: Sequence[Sighting]) -> None:
+        state = self.bus.odometry.latest
+        move = None
+        if self.stops and self.odometry.broken_since_mark:
+            self.leg = await in_thread(self.journal.begin_leg, self._header)
+            text = f"odometry was interrupted before stop {number}: leg {self.leg} begins there"
+            self.bus.events.publish(Event(now(), "mission", "warning", text))
+        elif self.stops:
+            move = self.odometry.move_since_mark()
+        self.odometry.mark()
+        stop = Stop(
+            leg=self.leg,
+            stop=number,
+            time=self._utc(),
+            odometry=state.pose if state is not None else Pose(0.0, 0.0, 0.0),
+            move=move,
+            sightings=tuple(sightings),
+        )
+        await in_thread(self.journal.add_stop, self.config.survey, stop)
+        self.stops.append(stop)
+        self.wake_upload()
+        seen = len({sighting.label for sighting in sightings})
+        text = f"stop {number} of {len(self.config.stops)}: {seen} labels, {len(sightings)} sightings"
+        self.bus.events.publish(Event(now(), "mission", "info", text))
+
+    # ---- faults ------------------------------------------------------------------------------------------------------
+
+    async def _through_faults(self, state: State, stop: int, step: Callable[[], Coroutine[Any, Any, T]]) -> T:
+        """Run a step; when a device fails wait for it to work again and repeat the step.
+
+        Raises MissionError when the step cannot be done: line lost, wheels stopped by the safety layer, or a device
+        that stays dead for FAULT_WAIT_S.
+        """
+        while True:
+            self._status(state, stop)
+            try:
+                return await _first(step(), self._trouble(driving=state == "driving"))
+            except DriverFault as fault:
+                self.base.halt()
+                self._status("paused", stop, str(fault))
+                await self._wait_healthy(str(fault))
+
+    async def _trouble(self, *, driving: bool) -> Any:
+        """Never returns; raises DriverFault when a device fails, MissionError when the wheels are held for HELD_S."""
+        since: float | None = None
+        while True:
+            await asyncio.sleep(0.05)
+            if (fault := self.health.fault()) is not None:
+                raise DriverFault(fault)
+            hazard = self.health.hazard()
+            since = None if hazard is None else now() if since is None else since
+            if driving and since is not None and now() - since >= HELD_S:
+                raise MissionError(f"halted: {hazard}")
+
+    async def _wait_healthy(self, fault: str) -> None:
+        deadline = now() + FAULT_WAIT_S
+        await asyncio.sleep(0.5)
+        while self.health.fault() is not None:
+            if now() > deadline:
+                raise MissionError(f"{fault}; it did not come back within {FAULT_WAIT_S:g} s")
+            await asyncio.sleep(0.2)
+
+    # ---- words -------------------------------------------------------------------------------------------------------
+
+    def _status(self, state: State, stop: int, text: str = "") -> None:
+        self.bus.status.publish(MissionStatus(now(), state, stop, len(self.config.stops), text))
+
+    def _utc(self) -> str:
+        return self.hardware.utc().astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def complete_map(solved: Map, labels: Sequence[str], stops: int, ended: str | None) -> Map:
+    """Add the labels that no stop saw, each with its reason, so that the map speaks of every label asked for.
+
+    Parameters
+    ----------
+    solved : Map
+        As the solver returned it: it knows only labels that were seen.
+    labels : sequence of str
+        Every label that the mission looked for.
+    stops : int
+        Stops made.
+    ended : str or None
+        Why the mission ended early.
+    """
+    known = {entry.label for entry in solved.labels}
+    if ended is None:
+        reason = (
+            f"its flash was seen at none of the {stops} stops: out of every camera's view, hidden, or its battery is "
+            "empty; add a stop that faces it"
+        )
+    else:
+        reason = f"not seen before the mission ended after {stops} stops ({ended})"
+    missing = [MappedLabel(label, "unplaced", reason=reason) for label in labels if label not in known]
+    notes = solved.notes if ended is None else (*solved.notes, f"the mission ended after {stops} stops: {ended}")
+    return replace(solved, labels=(*solved.labels, *missing), notes=notes)
+
+
+async def _cancel(task: asyncio.Task[Any]) -> None:
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    if not task.cancelled() and (error := task.exception()) is not None:
+        raise error
+
+
+async def _first(work: Coroutine[Any, Any, T], guard: Awaitable[Any]) -> T:
+    """The result of `work`, unless `guard` raises first; the other one is cancelled and awaited."""
+    working = asyncio.ensure_future(work)
+    guarding = asyncio.ensure_future(guard)
+    try:
+        await asyncio.wait({working, guarding}, return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            return working.result()
+        guarding.result()
+        raise AssertionError("a guard ends only by raising")
+    finally:
+        for task in (working, guarding):
+            task.cancel()
+        await asyncio.gather(working, guarding, return_exceptions=True)

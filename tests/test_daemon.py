@@ -1,0 +1,274 @@
+import asyncio
+import dataclasses
+import re
+import tomllib
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from robotd import daemon as daemon_module
+from robotd.bind import bind
+from robotd.bus import Bus
+from robotd.clock import now, run_virtual
+from robotd.config import Calibration, Config, save_calibration
+from robotd.daemon import ControlLoop, Supervisor, assemble
+from robotd.errors import ConfigError, DriverFault
+from robotd.mission import complete_map
+from robotd.odometry import Odometry, Wheels
+from robotd.plugin import Driver, available
+from robotd.records import CameraModel, DriveCommand, Map, MappedLabel, SensorFrame, SolverRun, Transform
+from robotd.safety import SafetyGate, SafetyLimits
+
+EXAMPLE = Path(__file__).parent.parent / "etc" / "robotd.toml"
+
+
+def uncommented(text):
+    """The example with its commented defaults switched on; comments behind values stay."""
+    return re.sub(r"^# (?=[a-z_]+ = |\[\[)", "", text, flags=re.MULTILINE)
+
+
+def test_the_example_explains_every_key_and_its_comments_show_the_defaults():
+    text = EXAMPLE.read_text()
+    given, full = tomllib.loads(text), tomllib.loads(uncommented(text))
+    config = bind(Config, full, "example")
+    problems = []
+
+    def compare(where, cls, shown, mentioned, required=()):
+        for item in dataclasses.fields(cls):
+            if item.name in required:
+                continue
+            if item.name not in mentioned:
+                problems.append(f"{where}: {item.name} is not explained")
+            elif item.name not in shown:
+                default = item.default if item.default is not dataclasses.MISSING else item.default_factory()
+                bound = bind(cls, mentioned, where)
+                if getattr(bound, item.name) != default and item.name not in ("url", "token_file", "known_labels"):
+                    problems.append(f"{where}.{item.name}: shows {getattr(bound, item.name)}, the default is {default}")
+
+    for section in ("robot", "upload", "safety", "mission"):
+        cls = type(getattr(config, section))
+        compare(section, cls, given.get(section, {}), full[section], ("identify",))
+    compare("identify", type(config.mission.identify), {}, full["mission"]["identify"])
+    points = available()
+    for name in ("base", "front", "follower", "labels"):
+        section = {key: value for key, value in full["drivers"][name].items() if key != "driver"}
+        cls = points[full["drivers"][name]["driver"]].load().Config
+        if name == "front":
+            continue
+        shown = {key: value for key, value in given["drivers"][name].items() if key != "driver"}
+        compare(name, cls, shown, section)
+    assert problems == []
+
+
+# ---- assembling ------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class FakeConfig:
+    port: int = 1
+    camera: str = "eye"
+
+
+def fake(kind_):
+    class Fake(Driver):
+        kind = kind_
+        Config = FakeConfig
+
+    return Fake
+
+
+@pytest.fixture
+def fakes(monkeypatch):
+    kinds = ("base", "camera", "follower", "labels")
+    monkeypatch.setattr(daemon_module, "load", lambda name, where: {kind: fake(kind) for kind in kinds}[name])
+
+
+CAMERA = CameraModel("front", (640, 480), (268.5, 268.5, 319.5, 239.5), Transform((0, 0, 0), (0, 0, 0.5)))
+
+
+def write_config(tmp_path, text, calibration=None):
+    path = tmp_path / "robotd.toml"
+    path.write_text('[robot]\ncalibration = "calibration.toml"\n' + text)
+    if calibration is not None:
+        save_calibration(calibration, tmp_path / "calibration.toml")
+    return path
+
+
+WHOLE = """
+[drivers.wheels]
+driver = "base"
+[drivers.front]
+driver = "camera"
+[drivers.eye]
+driver = "camera"
+[drivers.follower]
+driver = "follower"
+[drivers.labels]
+driver = "labels"
+"""
+
+
+def test_a_whole_configuration_becomes_drivers_in_opening_order(tmp_path, fakes):
+    path = write_config(tmp_path, WHOLE, Calibration(cameras=(CAMERA,)))
+    assembly = assemble(path, hardware=None)
+    assert [driver.name for driver in assembly.drivers] == ["wheels", "front", "eye", "labels", "follower"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("[drivers.front]", "[drivers.fornt]"), "knows the camera 'front', but there is no camera"),
+        (('driver = "labels"', 'driver = "camera"'), "found none of kind 'labels'"),
+        (("[drivers.eye]", "[drivers.iris]"), r"follower\] camera: there is no camera \[drivers.eye\]"),
+        (
+            ('driver = "base"', 'driver = "base"\nprot = 2'),
+            r"\[drivers.wheels\]: unknown key 'prot'; did you mean 'port'",
+        ),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path, fakes, change, message):
+    path = write_config(tmp_path, WHOLE.replace(*change), Calibration(cameras=(CAMERA,)))
+    with pytest.raises(ConfigError, match=message):
+        assemble(path, hardware=None)
+
+
+def test_mistakes_of_drivers_and_calibration_are_reported_together(tmp_path, fakes):
+    (tmp_path / "calibration.toml").write_text("[wheels]\nbsae = 1.0\n")
+    path = write_config(tmp_path, WHOLE.replace('driver = "base"', "driver = \"base\"\nport = 'x'"))
+    with pytest.raises(ConfigError) as caught:
+        assemble(path, hardware=None)
+    assert len(caught.value.problems) == 2
+
+
+def test_an_unknown_driver_names_the_installed_ones(tmp_path):
+    with pytest.raises(ConfigError, match=r"drivers.wheels\]: unknown driver 'rumba'; installed are .*roomba"):
+        assemble(write_config(tmp_path, '[drivers.wheels]\ndriver = "rumba"'), hardware=None)
+
+
+# ---- supervising -----------------------------------------------------------------------------------------------------
+
+
+def test_a_failing_driver_is_closed_reported_and_opened_again_with_growing_pauses():
+    class Flaky(Driver):
+        kind = "camera"
+        log: list[tuple[str, float]] = []  # noqa: RUF012
+
+        async def open(self):
+            self.log.append(("open", now()))
+            self.resources.callback(lambda: self.log.append(("close", now())))
+
+        async def run(self):
+            await asyncio.sleep(1.0)
+            raise DriverFault("unplugged")
+
+    async def main():
+        bus = Bus()
+        supervisor = Supervisor(Flaky("front", None, None, bus, Calibration()))
+        task = asyncio.create_task(supervisor.run())
+        await asyncio.sleep(0.5)
+        assert supervisor.fault is None
+        await asyncio.sleep(3.5)
+        assert supervisor.fault is None  # open for the third time
+        assert bus.events.latest.text == "front: unplugged; trying again in 1 s"
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        return Flaky.log
+
+    opened, closed = [0.0, 1.5, 3.5], [1.0, 2.5, 4.0]
+    expected = [
+        entry for pair in zip(opened, closed, strict=True) for entry in zip(("open", "close"), pair, strict=True)
+    ]
+    assert run_virtual(main()) == expected
+
+
+def test_a_bug_in_a_driver_is_not_swallowed():
+    class Buggy(Driver):
+        kind = "camera"
+
+        async def run(self):
+            raise KeyError("bug")
+
+    async def main():
+        await Supervisor(Buggy("front", None, None, Bus(), Calibration())).run()
+
+    with pytest.raises(KeyError):
+        run_virtual(main())
+
+
+# ---- the control loop ------------------------------------------------------------------------------------------------
+
+
+class FakeBase:
+    name = "base"
+
+    def __init__(self):
+        self.log = []
+
+    def drive(self, speed, turn_rate):
+        self.log.append((round(now(), 3), speed, turn_rate))
+
+    def halt(self):
+        self.log.append((round(now(), 3), "halt"))
+
+
+def drive_for(seconds, *, sensors_until=1e9, commands_until=1e9, bump_at=1e9):
+    async def main():
+        bus, base = Bus(), FakeBase()
+        loop = ControlLoop(bus, base, Odometry(Wheels()), SafetyGate(SafetyLimits()))
+        task = asyncio.create_task(loop.run())
+        travelled = 0.0
+        while now() < seconds:
+            await asyncio.sleep(0.015)
+            if now() < commands_until:
+                bus.commands.publish(DriveCommand(now(), 0.2, 0.0, "test"))
+            if now() < sensors_until:
+                travelled += 0.003
+                bus.sensors.publish(SensorFrame(now(), travelled, travelled, "safe", bump_left=now() >= bump_at))
+        cause = loop.cause
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        return base.log, cause, bus.odometry.latest
+
+    return run_virtual(main())
+
+
+def last_motion(log):
+    return max((entry[0] for entry in log if entry[1] not in ("halt", 0.0)), default=0.0)
+
+
+def test_commands_become_ramped_motion_and_sensor_frames_become_odometry():
+    log, cause, state = drive_for(2.0)
+    speeds = [entry[1] for entry in log if entry[1] != "halt"]
+    assert cause is None
+    assert max(speeds) == pytest.approx(0.2)
+    assert max(abs(b - a) for a, b in pairwise(speeds)) <= 0.5 * 0.0351
+    assert state.travelled == pytest.approx(0.4, abs=0.01)
+    assert log[-1][1] == "halt"
+
+
+@pytest.mark.parametrize(
+    ("trouble", "limit", "words"),
+    [
+        ({"sensors_until": 1.0}, 0.150 + 0.025, "no sensor frame"),
+        ({"commands_until": 1.0}, 0.200 + 0.025, "no drive command"),
+        ({"bump_at": 1.0}, 0.030, "left bumper"),
+    ],
+)
+def test_any_doubt_stops_the_wheels_in_time_and_says_why(trouble, limit, words):
+    log, cause, _ = drive_for(2.0, **trouble)
+    assert 0.9 < last_motion(log) <= 1.0 + limit
+    assert words in cause
+
+
+# ---- the map that is brought home ------------------------------------------------------------------------------------
+
+
+def test_labels_that_no_stop_saw_are_in_the_map_with_their_reason():
+    solved = Map("s", "first stop", (MappedLabel("a", "placed"),), (), (), 0.0, 0.0, SolverRun(1, True, "bundle"))
+    whole = complete_map(solved, ["a", "b"], 3, None)
+    assert [(label.label, label.status) for label in whole.labels] == [("a", "placed"), ("b", "unplaced")]
+    assert "none of the 3 stops" in whole.labels[1].reason
+    ended = complete_map(solved, ["a", "b"], 1, "line lost")
+    assert "line lost" in ended.labels[1].reason
+    assert "line lost" in ended.notes[-1]
