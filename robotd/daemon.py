@@ -176,9 +176,9 @@ class Supervisor:
                 await self.driver.run()
                 raise DriverFault(f"{self.driver.name}: stopped by itself")
             except DriverFault as fault:
-                text = str(fault)
-                self.fault = text if text.startswith(f"{self.driver.name}:") else f"{self.driver.name}: {text}"
-                self.driver.report(f"{self.fault}; trying again in {delay:g} s", "error")
+                text = str(fault).removeprefix(f"{self.driver.name}: ")
+                self.fault = f"{self.driver.name}: {text}"
+                self.driver.report(f"{text}; trying again in {delay:g} s", "error")
             finally:
                 await self.driver.close()
             if opened is not None and now() - opened > 10 * LAST_RETRY_S:

@@ -295,6 +295,7 @@ def _report(
         "labels_total": bundle_score.labels_total,
         "labels_placed": bundle_score.labels_placed,
         "error_mm": bundle_score.error_mm,
+        "linear_labels_placed": linear_score.labels_placed,
         "linear_error_mm": linear_score.error_mm,
         "cross_track_mm": cross_track,
         "stops": len(survey.stops),

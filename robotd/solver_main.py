@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -26,6 +27,8 @@ ALIGNMENTS = ("none", "se2", "se3")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # read when numpy loads; its matrices here are small
+        os.environ.setdefault(name, "1")
     try:
         code: int = arguments.run(arguments)
     except InputError as error:

@@ -170,7 +170,7 @@ def test_a_failing_driver_is_closed_reported_and_opened_again_with_growing_pause
         assert supervisor.fault is None
         await asyncio.sleep(3.5)
         assert supervisor.fault is None  # open for the third time
-        assert bus.events.latest.text == "front: unplugged; trying again in 1 s"
+        assert bus.events.latest.text == "unplugged; trying again in 1 s"
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         return Flaky.log

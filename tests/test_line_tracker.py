@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from robotd.geometry.camera import Camera
 from robotd.records import CameraModel, Line, Pose, Transform
 from robotd.vision.line_tracker import LineTracker, PoseHistory
 from robotd.vision.stroke import LineConfig, LineDetector
@@ -73,8 +74,6 @@ def test_the_view_shows_what_the_camera_sees():
 def test_a_tape_is_found_where_it_lies():
     """A floor drawn on a grid of 2 mm, seen through the lens: its line comes back to a millimetre."""
     model = floor_camera()
-    from robotd.geometry.camera import Camera
-
     lens = Camera(model)
     v, u = np.mgrid[0:240, 0:320]
     rays, _ = lens.rays(np.column_stack([u.ravel(), v.ravel()]).astype(float))

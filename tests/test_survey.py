@@ -1,6 +1,8 @@
 """Whole surveys in the simulator: the chain from bytes and pixels to the map, deterministic by seed."""
 
+import asyncio
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -121,12 +123,10 @@ def test_the_same_seed_gives_the_same_survey(first_run, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_tape_that_ends_early_gives_a_map_that_says_so(tmp_path, capsys):
-    text = (STORES / "corner.toml").read_text().replace("width = 0.050", "width = 0.006")
-    store = tmp_path / "thin.toml"
-    store.write_text(text)
-    code = main(["demo", "--store", str(store), "--out", str(tmp_path / "out"), "--json"])
-    printed = capsys.readouterr()
+def test_a_line_that_cannot_be_seen_gives_a_map_that_says_so(tmp_path, capsys):
+    world = tmp_path / "fog.toml"
+    world.write_text("[world.floor]\nnoise = 50.0\nblur = 8.0\n")
+    code, printed = run_demo(tmp_path / "out", capsys, "--world", str(world))
     assert code == 0, printed.err
     result = json.loads(printed.out)
     assert result["stops"] == 1
@@ -135,3 +135,36 @@ def test_a_tape_that_ends_early_gives_a_map_that_says_so(tmp_path, capsys):
     assert {label.status for label in found.labels} == {"unplaced"}
     assert all(label.reason for label in found.labels)
     assert any("line" in note for note in found.notes)
+
+
+class PulledCables(World):
+    """Somebody trips over the left camera's cable at stop 1 and over the base's at stop 2."""
+
+    async def run(self):
+        async def clumsy():
+            for device, near in (("/dev/robotd/left", 0.0), ("/dev/robotd/base", 0.75)):
+                while (
+                    math.hypot(self.body.pose.x - self.body.start.x, self.body.pose.y - self.body.start.y) < near - 0.02
+                ):
+                    await asyncio.sleep(0.1)
+                await asyncio.sleep(12.0)
+                self.unplug(device)
+                await asyncio.sleep(2.0)
+                self.plug(device)
+
+        async with asyncio.TaskGroup() as group:
+            group.create_task(super().run())
+            group.create_task(clumsy())
+
+
+@pytest.mark.slow
+def test_pulled_cables_pause_the_mission_and_cost_no_stop(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("robotd.demo.World", PulledCables)
+    code, printed = run_demo(tmp_path / "out", capsys)
+    assert code == 0, printed.err
+    assert printed.err.count("plug the camera in again") >= 1
+    assert printed.err.count("plug the adapter in again") >= 1
+    survey = load_survey(tmp_path / "out" / "survey.json")
+    assert [(stop.leg, stop.stop) for stop in survey.stops] == [(1, 1), (2, 2), (2, 3)]
+    assert [stop.move is None for stop in survey.stops] == [True, True, False]
+    assert json.loads(printed.out)["labels_placed"] >= 5

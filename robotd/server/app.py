@@ -19,7 +19,9 @@ import hashlib
 import hmac
 import logging
 import re
+import signal
 import socket
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -146,6 +148,9 @@ def serve(host: str, port: int, data: Path, token: str | None, ready: Callable[[
             timeout_graceful_shutdown=5,  # s; a map that is being solved does not hold up the end
             ws="none",
         )
+        if threading.current_thread() is threading.main_thread():
+            # uvicorn raises the signal again after its clean shutdown, which would cut ours short
+            signal.signal(signal.SIGTERM, lambda *_: None)
         with suppress(KeyboardInterrupt):
             _Server(config, lambda: ready(url)).run(sockets=[listener])
 

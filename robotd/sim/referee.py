@@ -39,9 +39,20 @@ class Referee:
         return evaluate(solved, self.truth(), align="none")
 
     def cross_track_mm(self) -> dict[str, float]:
-        """Distance of the robot's origin from the tape's centre, over equal steps of the way driven: rms and max."""
-        trail = self._world.body.trail()  # (N, 3) x, y, heading in store axes
-        distance = self._world.line.distance(_even(trail[:, :2], 0.01))
+        """Distance of the robot's origin from the tape's centre, over equal steps of the way driven: rms and max.
+
+        Beyond an open line's ends it is the distance from the tape's straight prolongation: stopping a little late
+        there is an error along the track.
+        """
+        line = self._world.line
+        points = _even(self._world.body.trail()[:, :2], 0.01)
+        distance, foot = line.nearest(points)
+        if not line.closed:
+            beyond = (foot <= 0.0) | (foot >= line.length)
+            away = points[beyond] - line.point_at(foot[beyond])
+            heading = line.heading_at(foot[beyond])
+            distance[beyond] = away[:, 1] * np.cos(heading) - away[:, 0] * np.sin(heading)
+        distance = np.abs(distance)
         rms = float(np.sqrt(np.mean(distance**2))) if len(distance) else 0.0
         return {"rms": round(1e3 * rms, 2), "max": round(1e3 * float(distance.max(initial=0.0)), 2)}
 

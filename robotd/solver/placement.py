@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..geometry.transforms import heading_matrix, se2_compose
+from ..geometry.transforms import heading_matrix, se2_compose, se2_inverse
 from ..records import Floats
 from .initial import chain, locate, triangulate, world_rays
 from .problem import STOP, Bools, Ints, Known, Problem, State
@@ -44,12 +44,27 @@ def place(problem: Problem, moves: Floats, tolerance: float) -> Placement:
     segment = segments(problem)
     local = chain(problem, moves, segment)
     axes: dict[int, Floats] = {}
-    if problem.frame == "first stop":
-        axes[0] = problem.odometry[0]
     for k in range(int(segment[-1]) + 1):
-        pose = None if k in axes else _by_roof(problem, local, segment == k)
+        pose = _by_roof(problem, local, segment == k)
         if pose is not None:
             axes[k] = pose
+    if problem.frame == "first stop":
+        axes[0] = problem.odometry[0]
+        longest = int(np.argmax(np.bincount(segment)))
+        if longest != 0:  # grow from there, because a short first run may triangulate nothing to join others by
+            grown = {longest: np.zeros(3)}
+            _grow(problem, local, segment, grown, tolerance)
+            if 0 in grown:
+                shift = se2_compose(problem.odometry[0], se2_inverse(grown[0]))
+                axes = {k: se2_compose(shift, pose) for k, pose in grown.items()}
+    state, found = _grow(problem, local, segment, axes, tolerance)
+    return Placement(state, np.isin(segment, list(axes)), found)
+
+
+def _grow(
+    problem: Problem, local: Floats, segment: Ints, axes: dict[int, Floats], tolerance: float
+) -> tuple[State, Bools]:
+    """Add to `axes` every run that shared labels join to those in it; returns the state and the points found."""
     known = np.full((len(problem.labels), 3), np.nan)
     known[problem.known.label] = problem.known.position
     while True:
@@ -59,7 +74,7 @@ def place(problem: Problem, moves: Floats, tolerance: float) -> Placement:
             k for k in range(int(segment[-1]) + 1) if k not in axes and _join(problem, local, segment, k, axes, targets)
         ]
         if not joined:
-            return Placement(state, np.isin(segment, list(axes)), found)
+            return state, found
 
 
 def _assemble(

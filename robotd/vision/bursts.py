@@ -18,9 +18,11 @@ from .pattern import FlashPattern, Template
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-_CAP = 10.0  # no single period convinces more than e^10: what looks certain may be a reflection of somebody else
-_HIDDEN = 0.12  # relative change of the light around a place that says somebody stands before it
+_CAP_LIT = 10.0  # no single period convinces more than e^10 that a burst was there,
+_CAP_DARK = 7.0  # or than e^7 that none was: now and then somebody of the wall's own brightness stands before a light
+_HIDDEN = 0.05  # relative change of the light around a place that says somebody stands before it
 _LATE = 7.0  # log-odds against a second flash in one window
+_PHASES = 10  # parts of a period; flashes whose starts are in the same or the next part have the same phase
 _ACTIVE = 0.72  # of the full light: what coarse sampling leaves of a burst; one flash too late gives 0.5 to 0.75
 
 
@@ -86,7 +88,7 @@ class BurstScorer:
         for places, begin in ((slice(0, known), max(self._done, first)), (slice(known, None), first)):
             if end > begin and len(values[places]):
                 self._score(times, values, levels, light, variance, places, begin, end)
-        calm = np.abs(usual - self._reference) < 0.5 * _HIDDEN * self._reference + 0.5
+        calm = np.abs(usual - self._reference) < _HIDDEN * self._reference + 0.5
         self._reference += np.where(calm, 0.1 * (usual - self._reference), 0.0)
         self._done = max(self._done, end)
 
@@ -99,9 +101,9 @@ class BurstScorer:
         if last == first:
             return Runs(np.zeros((places, len(durations))), np.full((places, len(durations)), begin))
         raw = self._ratio(slice(first, last), light, variance)
-        capped = np.clip(raw, -_CAP, _CAP)
+        capped = np.clip(raw, -_CAP_DARK, _CAP_LIT)
         whole = last - first
-        score = np.full((places, len(durations)), -_CAP)
+        score = np.full((places, len(durations)), -_CAP_DARK)
         start = np.full_like(score, begin)
         sums = self._run_sums(capped, max(durations))
         exact = self._run_sums(raw, max(durations))
@@ -126,13 +128,23 @@ class BurstScorer:
         return sums
 
     def _earlier_run(self, sums: list[Floats], whole: int) -> Floats:
-        """What a flash explains that began late, in answer to an earlier request, and ended a period ago."""
-        best = np.zeros((sums[0].shape[0], whole))
-        for k, total in enumerate(sums):
+        """What a flash explains that began late, in answer to an earlier request, and ended a period ago.
+
+        Only if its phase is another: with the same phase it is rather one flash, seen in two parts.
+        """
+        places = sums[0].shape[0]
+        rows = -(-whole // self._step)
+        ended = np.zeros((places, rows * self._step))
+        for k, total in enumerate(sums[1:], start=1):
             after = (k + 2) * self._step
-            if k and after < whole:
-                best[:, after:] = np.maximum(best[:, after:], total[:, : whole - after] - _LATE)
-        return np.asarray(np.maximum.accumulate(best, axis=1))
+            if after < whole:
+                ended[:, after:whole] = np.maximum(ended[:, after:whole], total[:, : whole - after] - _LATE)
+        parts = np.array_split(ended.reshape(places, rows, self._step), _PHASES, axis=2)
+        best = np.maximum.accumulate(np.stack([part.max(axis=2) for part in parts], axis=2), axis=1)
+        far = np.minimum(np.arange(_PHASES), _PHASES - np.arange(_PHASES)) > 1
+        other = np.stack([best[:, :, np.roll(far, k)].max(axis=2) for k in range(_PHASES)], axis=2)
+        widths = [part.shape[2] for part in parts]
+        return np.asarray(np.repeat(other, widths, axis=2).reshape(places, -1)[:, :whole])
 
     def _reserve(self, places: int, grid: int) -> None:
         _, have, length = self._sums.shape
@@ -169,7 +181,7 @@ class BurstScorer:
         y = values[places].astype(float)
         y -= np.median(y, axis=1, keepdims=True)
         reference, on, noise = self._reference[places, None], light[places, None], np.sqrt(variance[places, None])
-        seen = np.abs(levels[places] - reference) <= _HIDDEN * reference + 1.0
+        seen = np.abs(levels[places] - reference) <= _HIDDEN * reference + 0.6
         seen &= (y > -6.0 * noise - 0.5 * on) & (y < 1.6 * on + 6.0 * noise)
         weights = seen.astype(float)
         y *= weights

@@ -33,7 +33,7 @@ class TrackerConfig:
     join: float = 0.20  # longest gap between the memory's end and a piece that continues it
     point_sigma: float = 0.002  # of a seen point across the line
     tilt_sigma: float = 0.006  # of the floor against the camera: 0.3 degrees
-    stamp_sigma: float = 0.03  # of the camera's constant stamp error
+    stamp_sigma: float = 0.02  # of the camera's constant stamp error
     turn_noise: float = 0.018  # heading after one metre of odometry
     travel_noise: float = 0.003  # of each wheel after one metre
     independent: float = 8.0  # points of one frame that count as independent
@@ -124,6 +124,7 @@ class LineTracker:
         self.config = config
         self._row_time = row_time
         self.stamp_error = 0.0
+        self._covariance: Floats = np.diag([0.0, 0.0, 0.0, config.stamp_sigma**2])
         self.reset()
 
     def reset(self) -> None:
@@ -133,8 +134,7 @@ class LineTracker:
         self._lost = 0.0
         self._last: tuple[Pose, float] | None = None  # pose and metres travelled at the last frame
         self._conflicts = 0
-        stamps = self._covariance[3, 3] if hasattr(self, "_covariance") else self.config.stamp_sigma**2
-        self._covariance: Floats = np.diag([1e-6, 1e-6, 1e-6, stamps])
+        self._covariance = np.diag([1e-6, 1e-6, 1e-6, self._covariance[3, 3]])  # of x, y, heading and stamps
 
     def lost(self, travelled: float) -> float:
         """Metres driven while the line should have been in view but was not, also if frames stopped coming."""
@@ -258,10 +258,12 @@ class LineTracker:
         start, step = self.path[:-1], np.diff(self.path, axis=0)
         size = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
         unit = step / size[:, None]
-        away = sight.points[:, None] - start[None]
-        along = (away * unit).sum(axis=2)
+        points, start = sight.points - start[0], start - start[0]
+        along = points @ unit.T - (start * unit).sum(axis=1)
         share = np.clip(along, 0.0, size)
-        square = ((away - share[..., None] * unit) ** 2).sum(axis=2)
+        # |p - start - share unit|^2, multiplied out so that only (points, segments) arrays are made
+        square = (points**2).sum(axis=1)[:, None] + (start**2).sum(axis=1) - 2.0 * points @ start.T
+        square += share * (share - 2.0 * along)
         heading = directions(sight.points)
         turned = heading @ unit.T < 0.7
         square = np.where(turned, square + 1.0, square)  # a hairpin's other leg is not this one
@@ -271,7 +273,7 @@ class LineTracker:
         place = lengths[best] + share[rows, best]
         ends = ((best == 0) & (along[rows, best] < 0.0)) | ((best == len(size) - 1) & (along[rows, best] > size[-1]))
         normal = np.column_stack([-unit[best, 1], unit[best, 0]])
-        offset = (away[rows, best] * normal).sum(axis=1)
+        offset = ((points - start[best]) * normal).sum(axis=1)
         on = (square[rows, best] < self.config.match**2) & ~ends
         if on.sum() < 3:
             return None

@@ -39,7 +39,8 @@ PARALLEL = math.cos(math.radians(28.0))  # tape tapers, tight curves bend: the l
 ALIGNED = math.cos(math.radians(35.0))  # strokes of one window of a trace against its direction
 MUTUAL = 0.4  # widths between an edge and the return of its partner's walk
 LEVEL_SPAN = 3.0  # greatest ratio of widths searched at one scale
-MOST_LINES = 16  # candidates that are judged in one frame
+MOST_LINES = 16  # pieces that are traced and judged at one scale
+MOST_SPREAD = 0.16  # of the stroke width: beyond it no other evidence makes up for it
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ class _Workspace:
         )
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Piece:
     """A traced polyline in working pixels and the evidence for it."""
 
@@ -202,9 +203,8 @@ class LineDetector:
                 work.edge, found, work.index, level.low, level.high, sign, PARALLEL, MUTUAL, work.partner, work.stroke
             )
             pieces = _joined(_traced(work, work.stroke[:count], level), level)
-            pieces.sort(key=lambda piece: -piece.strokes)
             ratio = np.array([gray.shape[1] / work.grey.shape[1], gray.shape[0] / work.grey.shape[0]])
-            lines += [_judged(piece, work, ratio, sign, doubt) for piece in pieces[:MOST_LINES]]
+            lines += [_judged(piece, work, ratio, sign, doubt) for piece in pieces]
         return [line for line in lines if line.confidence >= self.config.min_confidence]
 
     def _prepare(self, level: _Level, gray: Bytes, mask: Bytes | None) -> _Workspace:
@@ -261,8 +261,8 @@ def _traced(work: _Workspace, stroke: Singles, level: _Level) -> list[_Piece]:
         return []
     sizes = np.bincount(labels[labels >= 0])
     pieces: list[_Piece] = []
-    for label in np.argsort(-sizes, kind="stable")[: 3 * MOST_LINES]:
-        if sizes[label] < level.reference:
+    for label in np.argsort(-sizes, kind="stable"):
+        if sizes[label] < level.reference or len(pieces) >= MOST_LINES:
             break
         members = np.flatnonzero(labels == label)
         width = float(np.median(stroke[members, 4]))
@@ -314,38 +314,52 @@ def _trace_both_ways(work: _Workspace, stroke: Singles, state: Bytes, seed: int,
 
 def _joined(pieces: list[_Piece], level: _Level) -> list[_Piece]:
     """Join pieces whose ends face each other over a gap or meet in a corner, nearest ends first."""
-    pieces = [piece for piece in pieces if arc_length(piece.points)[-1] >= 0.8 * piece.width]
-    pieces = sorted(pieces, key=lambda piece: -piece.strokes)[: 2 * MOST_LINES]
+    pieces = [
+        piece for piece in pieces if piece.spread < MOST_SPREAD and arc_length(piece.points)[-1] >= 0.8 * piece.width
+    ]
+    refused: set[tuple[_Piece, bool, _Piece, bool]] = set()
     while True:
-        best: tuple[float, int, int, bool, bool, Floats] | None = None
-        for i, one in enumerate(pieces):
-            for j, two in enumerate(pieces[i + 1 :], start=i + 1):
-                if one.closed or two.closed or abs(math.log(one.width / two.width)) > 0.25:
-                    continue
-                for flip_one in (False, True):
-                    for flip_two in (False, True):
-                        first = one.points[::-1] if flip_one else one.points
-                        second = two.points[::-1] if flip_two else two.points
-                        gap = float(np.hypot(*(second[0] - first[-1])))
-                        if best is not None and gap >= best[0]:
-                            continue
-                        between = bridge(first, second, one.width)
-                        if between is not None:
-                            best = (gap, i, j, flip_one, flip_two, between)
-        if best is None:
+        joint = _nearest_joint(pieces, level, refused)
+        if joint is None:
             return pieces
-        _, i, j, flip_one, flip_two, between = best
-        two, one = pieces.pop(j), pieces.pop(i)
-        first = one.points[::-1] if flip_one else one.points
-        second = two.points[::-1] if flip_two else two.points
+        one, two, first, second, between, gap = joint
         if len(between):
             first, second = cut_back(first, between[0]), cut_back(second[::-1], between[0])[::-1]
-        total = one.strokes + two.strokes
-        points = np.vstack([first, between, second])
-        mixed = [(a * one.strokes + b * two.strokes) / total for a, b in
-                 ((one.width, two.width), (one.spread, two.spread))]  # fmt: skip
-        windows = one.travelled + two.travelled + round(best[0] / max(0.4 * one.width, 2.0))
-        pieces.append(_Piece(points, mixed[0], mixed[1], one.filled + two.filled, windows, total))
+        share = two.strokes / (one.strokes + two.strokes)
+        joined = _Piece(
+            np.vstack([first, between, second]),
+            one.width + share * (two.width - one.width),
+            one.spread + share * (two.spread - one.spread),
+            one.filled + two.filled,
+            one.travelled + two.travelled + round(gap / max(0.4 * one.width, 2.0)),
+            one.strokes + two.strokes,
+        )
+        pieces = [piece for piece in pieces if piece is not one and piece is not two] + [joined]
+
+
+def _nearest_joint(
+    pieces: list[_Piece], level: _Level, refused: set[tuple[_Piece, bool, _Piece, bool]]
+) -> tuple[_Piece, _Piece, Floats, Floats, Floats, float] | None:
+    """The two pieces whose ends belong together and are nearest, both turned so that one runs into the other.
+
+    `refused` remembers which ends were found not to belong together.
+    """
+    ends = [(piece, flip) for piece in pieces if not piece.closed for flip in (False, True)]
+    places = np.array([piece.points[0 if flip else -1] for piece, flip in ends]).reshape(-1, 2)
+    gaps = np.sqrt(((places[:, None] - places[None]) ** 2).sum(axis=2))
+    rows, columns = np.nonzero(np.triu(gaps < 3.0 * level.high, 1))
+    for i, j in sorted(zip(rows, columns, strict=True), key=lambda pair: gaps[pair]):
+        (one, flip_one), (two, flip_two) = ends[i], ends[j]
+        key = (one, flip_one, two, flip_two)
+        if one is two or key in refused or abs(math.log(one.width / two.width)) > 0.25:
+            continue
+        first = one.points[::-1] if flip_one else one.points
+        second = two.points if flip_two else two.points[::-1]
+        between = bridge(first, second, one.width)
+        if between is not None:
+            return one, two, first, second, between, float(gaps[i, j])
+        refused.add(key)
+    return None
 
 
 def _confidence(piece: _Piece, work: _Workspace, sign: float, doubt: float) -> float:
