@@ -149,7 +149,7 @@ def _summarise(result: Map) -> None:
     end = "converged" if result.solver.converged else "did not converge"
     print(
         f"{result.survey}: {len(result.labels)} labels ({states or 'none seen'}), {len(result.stops)} stops, "
-        f"{result.rms_px:.2f} px rms, {end} after {result.solver.iterations} iterations",
+        f"{result.rms_px:.2g} px rms, {end} after {result.solver.iterations} iterations",
         file=sys.stderr,
     )
     for label in result.labels:

@@ -142,7 +142,7 @@ def map_png(
     axes = figure.add_axes((0.06, 0.065, 0.66, 0.835))
     figure.text(0.06, 0.955, f"Map of {_plain(result.survey, 40)}", size=16, weight="bold", color=INK)
     method = {"bundle": "bundle adjustment", "linear": "linear triangulation"}[result.solver.method]
-    figure.text(0.06, 0.922, f"{_counts(result)} · {method} · {result.rms_px:.2f} px rms", size=9.5, color=MUTED)
+    figure.text(0.06, 0.922, f"{_counts(result)} · {method} · {result.rms_px:.2g} px rms", size=9.5, color=MUTED)
 
     _draw_outline(axes, outline)
     _draw_paths(axes, result, _odometry_paths(result, survey, trail))
@@ -443,7 +443,7 @@ def _page_data(
     mapped = {label.label for label in result.labels}
     return {
         "survey": result.survey,
-        "summary": f"{_counts(result)}, {result.rms_px:.2f} px rms",
+        "summary": f"{_counts(result)}, {result.rms_px:.2g} px rms",
         "frame": result.frame,
         "errors": None if not errors else _statistics([float(np.linalg.norm(error)) for error in errors.values()]),
         "labels": labels,
