@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DEV := $(VENV)/.dev
+PIP = $(if $(shell command -v uv),VIRTUAL_ENV="$(CURDIR)/$(VENV)" uv pip install -q,$(BIN)/python -m pip install -q --disable-pip-version-check)
 # numpy's and OpenCV's own threads only get in each other's way here
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
@@ -12,10 +14,10 @@ export OMP_NUM_THREADS := 1
 demo: $(READY)
 	$(BIN)/robotd demo --out out/demo
 
-test: $(READY)
+test: $(DEV)
 	$(BIN)/python -m pytest
 
-check: $(READY)
+check: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	rm -rf build/types && mkdir -p build/types
@@ -26,26 +28,27 @@ check: $(READY)
 bench: $(READY)
 	$(BIN)/python -m tests.bench
 
-campaign: $(READY)
+campaign: $(DEV)
 	HYPOTHESIS_PROFILE=campaign $(BIN)/python -m pytest tests/campaign tests
 
-setup: $(READY)
+setup: $(DEV)
 
-# the stamp is written last: a half-made .venv is made again
+# the stamps are written last: what was left half made is made again
 $(READY): pyproject.toml setup.py $(wildcard cython/*.pyx) | prerequisites
-	rm -f $(READY)
-	test -x $(BIN)/python || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
-	if command -v uv >/dev/null 2>&1; then \
-	    VIRTUAL_ENV="$(CURDIR)/$(VENV)" uv pip install -q -e '.[dev]'; \
-	else \
-	    $(BIN)/python -m pip install -q --disable-pip-version-check -e '.[dev]'; \
-	fi
-	if pkg-config --exists libsystemd 2>/dev/null; then \
-	    $(BIN)/python -m pip install -q --disable-pip-version-check 'systemd-python>=235'; \
-	else \
-	    echo "note: libsystemd-dev and pkg-config are not installed, so systemd-python is left out (robotd has a fallback)"; \
-	fi
+	rm -f $(READY) $(DEV)
+	test -x $(BIN)/pip || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
+	$(PIP) 'setuptools>=69' 'cython>=3.0.10' 'numpy>=2.0'
+	$(PIP) --no-build-isolation -e '.[solver]'
 	touch $(READY)
+
+$(DEV): $(READY)
+	$(PIP) --no-build-isolation -e '.[dev]'
+	if pkg-config --exists libsystemd 2>/dev/null; then \
+	    $(PIP) 'systemd-python>=235'; \
+	else \
+	    echo "note: without pkg-config and libsystemd-dev, systemd-python is left out (robotd has a fallback)"; \
+	fi
+	touch $(DEV)
 
 prerequisites:
 	@test -e $(READY) || sh .ci/prerequisites $(PYTHON)

@@ -64,4 +64,5 @@ setup(
         ("share/robotd/systemd", ["systemd/robotd.service"]),
     ],
     ext_modules=kernels(),
+    options={"build_ext": {"parallel": os.cpu_count() or 1}},
 )
