@@ -513,10 +513,10 @@ def test_nearly_parallel_views_are_not_enough():
     assert label.reason.startswith("views nearly parallel")
 
 
-def reflected(survey, truth, name, stops, probability):
-    """Rival sightings of one label: its image in a mirror behind it, from the given stops."""
+def reflected(survey, truth, name, stops, probability=None, raised=0.0):
+    """Rival sightings of one label: its image in a mirror behind it, from the given stops; `raised` by a tilted one."""
     x, y, z = truth[name]
-    image = np.array([[x, 2.0 * (y - 0.5) - y, z]])
+    image = np.array([[x, 2.0 * (y - 0.5) - y, z + raised]])
 
     def change(stop):
         sightings = [s for s in stop.sightings if s.label != name or stop.stop in stops]
@@ -537,7 +537,7 @@ def reflected(survey, truth, name, stops, probability):
 def test_tied_mirror_solutions_are_reported_with_both_candidates():
     survey, truth = quiet_room()
     seen = [s.stop for s in survey.stops if sum(g.label == "S04" for g in s.sightings) == 1][:3]
-    label = label_of(solve(reflected(survey, truth, "S04", seen, None)), "S04")
+    label = label_of(solve(reflected(survey, truth, "S04", seen, raised=0.3)), "S04")
     assert (label.status, label.position) == ("ambiguous", None)
     assert len(label.candidates) == 2
     assert min(np.linalg.norm(np.subtract(c.position, truth["S04"])) for c in label.candidates) < 1e-3
@@ -547,9 +547,28 @@ def test_tied_mirror_solutions_are_reported_with_both_candidates():
 def test_the_probability_of_sightings_breaks_a_tie():
     survey, truth = quiet_room()
     seen = [s.stop for s in survey.stops if sum(g.label == "S04" for g in s.sightings) == 1][:3]
-    label = label_of(solve(reflected(survey, truth, "S04", seen, 0.3)), "S04")
+    label = label_of(solve(reflected(survey, truth, "S04", seen, 0.3, raised=0.3)), "S04")
     assert label.status == "placed"
     np.testing.assert_allclose(label.position, truth["S04"], atol=1e-4)
+
+
+@pytest.mark.parametrize("direct", [2, 3])
+def test_of_a_label_and_its_image_in_upright_glass_the_nearer_one_is_the_label(direct):
+    survey, truth = quiet_room()
+    both = reflected(survey, truth, "S04", [s.stop for s in survey.stops])
+    seen = [s.stop for s in survey.stops if sum(g.label == "S04" for g in s.sightings) == 1]
+    assert len(seen) > direct
+
+    def mostly_the_image(stop):  # the label itself from a few stops, its image from all
+        mine = [s for s in stop.sightings if s.label == "S04"]
+        hidden = mine[:1] if len(mine) == 2 and stop.stop in seen[direct:] else []
+        return [s for s in stop.sightings if not any(s is h for h in hidden)]
+
+    result = solve(with_sightings(both, mostly_the_image))
+    label = label_of(result, "S04")
+    assert label.status == "placed"
+    np.testing.assert_allclose(label.position, truth["S04"], atol=1e-4)
+    assert sum(s.weight == 0.0 for s in result.sightings if s.label == "S04") > direct
 
 
 def test_a_label_whose_sightings_do_not_meet_is_unplaced():

@@ -1,8 +1,11 @@
 """Whole surveys in the simulator: the chain from bytes and pixels to the map, deterministic by seed."""
 
 import asyncio
+import contextlib
+import io
 import json
 import math
+import subprocess
 import sys
 from pathlib import Path
 
@@ -60,9 +63,6 @@ def first_run(tmp_path_factory):
 
     patch.setattr(Daemon, "run", run)
     patch.setattr(Referee, "__init__", init)
-    import contextlib
-    import io
-
     printed, shown = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(shown):
         code = main(["demo", "--store", str(STORES / "corner.toml"), "--seed", "3", "--out", str(out), "--json"])
@@ -80,7 +80,6 @@ def test_a_survey_places_the_labels_that_can_be_seen(first_run):
     assert result["stops"] == 3
     assert result["error_mm"]["mean"] <= 25.0
     assert result["cross_track_mm"]["rms"] <= 20.0
-    assert result["peak_mb"] <= 500.0
     for name in ("survey.json", "truth.csv", "map.json", "map.csv", "map.html", "map.png"):
         assert (out / name).stat().st_size > 100, name
 
@@ -115,10 +114,12 @@ def test_the_survey_carries_moves_with_covariance_and_honest_pixels(first_run):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_survey(first_run, tmp_path, capsys):
-    code, _ = run_demo(tmp_path / "again", capsys)
-    assert code == 0
-    first, again = (load_survey(path / "survey.json") for path in (first_run[0], tmp_path / "again"))
+def test_the_same_seed_gives_the_same_survey_in_a_process_of_its_own(first_run, tmp_path):
+    command = [sys.executable, "-m", "robotd", "demo", "--store", str(STORES / "corner.toml"), "--seed", "3", "--json"]
+    done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["peak_mb"] <= 500.0
+    first, again = (load_survey(path / "survey.json") for path in (first_run[0], tmp_path))
     assert first == again
 
 

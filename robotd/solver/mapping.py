@@ -131,7 +131,7 @@ def _label(asked: Problem, optimum: Optimum, i: int, count: int) -> MappedLabel:
             f"its {count} sightings do not meet in one point (reflections or wrong identities); flash it again, alone"
         )
     agreeing = len(set(problem.sightings.stop[mine & optimum.inlier].tolist()))
-    doubt = problem.sightings.probability[mine & ~optimum.inlier & ~optimum.in_floor].sum()
+    doubt = problem.sightings.probability[mine & ~optimum.inlier & ~optimum.reflected].sum()
     if agreeing < _TRUSTED_STOPS and doubt >= problem.sightings.probability[mine & optimum.inlier].sum():
         return unplaced(f"only {inliers} of its {count} sightings agree, which may be chance; flash it again, alone")
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))

@@ -27,6 +27,9 @@ _REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tel
 _CLEAN = 0.97  # share of sightings explained at which no other start can do better
 _SAME = 0.5  # difference of two starts' costs below which they found the same minimum
 _FLOOR_IMAGE_PX = 6.0
+_UPRIGHT_M = 0.03  # a label and its image in upright glass are equally high; what tilt and calibration leave
+_IMAGES = 4  # images of one label in different panes that are looked for
+_CHANCE = 0.45  # share of an image's support with which the label itself stands out from chance
 _MEDIAN = 2.0 * np.log(2.0)  # of the squared length of a standard normal vector in the plane
 
 
@@ -57,7 +60,7 @@ class Optimum:
 
     `problem` has slipped moves, wrong known labels and unplaced stops taken out. `inlier` (N,) says which of its
     sightings take part; `adjustment` is their least-squares problem and `state` its optimum. `placed` (S,) are the
-    stops that have a place in the world. `in_floor` (N,) are sightings of a label's reflection in the floor. `gain`
+    stops that have a place in the world. `reflected` (N,) are sightings of a label's image in floor or glass. `gain`
     (L,) is each label's support, `rival_points` (L, 3) the second best position (NaN where there is none) and
     `rival_gain` (L,) its support.
     """
@@ -68,7 +71,7 @@ class Optimum:
     inlier: Bools
     adjustment: Adjustment
     covariance: Covariance
-    in_floor: Bools
+    reflected: Bools
     gain: Floats
     rival_points: Floats
     rival_gain: Floats
@@ -146,8 +149,10 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
     everything = Adjustment(problem, problem.sightings)
     solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=1e-2)
     iterations, state = iterations + solution.iterations, solution.state
+    state, _ = _out_of_glass(problem, state)
     gain, rival_points, rival_gain = _hypotheses(problem, state)
     better = rival_gain > gain
+    better &= ~(_level(problem, state, rival_points) & _farther(problem, state, rival_points))
     if better.any():
         state = replace(state, points=np.where(better[:, None], rival_points, state.points))
         problem = _without_known(problem, state, np.flatnonzero(better[problem.known.label]))
@@ -159,7 +164,8 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         if factor == 1.0:
             break
         problem = _rescaled(problem, factor)
-    gain, rival_points, rival_gain = _hypotheses(problem, state)
+    _, reflected = _out_of_glass(problem, state)
+    gain, rival_points, rival_gain = _hypotheses(problem, state, reflected)
     factor = float(np.median(problem.sightings.sigma / stated)) if len(stated) else 1.0
     if factor > 1.0:
         note = f"sightings scatter {factor:.1f} times as much as their sigma_px says; uncertainties were scaled"
@@ -171,7 +177,7 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         inlier,
         adjustment,
         sure,
-        _in_floor(problem, state) & ~inlier,
+        (_in_floor(problem, state) | reflected) & ~inlier,
         gain,
         rival_points,
         rival_gain,
@@ -288,16 +294,73 @@ def _rescaled(problem: Problem, factor: float) -> Problem:
     return replace(problem, sightings=replace(problem.sightings, sigma=problem.sightings.sigma * factor))
 
 
-def _hypotheses(problem: Problem, state: State) -> tuple[Floats, Floats, Floats]:
+def _out_of_glass(problem: Problem, state: State) -> tuple[State, Bools]:
+    """Take labels out of the mirrors in which they were found.
+
+    A label's image in a pane is as consistent as the label, and may be seen from more stops. But the robot and the
+    label are on the same side of the pane, so from every stop the image is farther away than the label: of two
+    positions that are equally high, as they are with upright glass, the nearer one is the label, unless it has so
+    little support that chance could have made it.
+
+    Returns
+    -------
+    state, reflected
+        With the labels at the nearer positions, and the sightings (N,) that the farther ones explain.
+    """
+    reflected = np.zeros(len(problem.sightings), dtype=np.bool_)
+    everything = Adjustment(problem, problem.sightings)
+    for _ in range(_IMAGES):
+        gain, rivals, rival_gain = _hypotheses(problem, state, reflected)
+        swap = _level(problem, state, rivals) & _nearer(problem, state, rivals) & (rival_gain > _CHANCE * gain)
+        keep = _level(problem, state, rivals) & _farther(problem, state, rivals)
+        if not (swap | keep).any():
+            break
+        images = np.where(keep[:, None], rivals, state.points)
+        _, shown = _support(everything, replace(state, points=images))
+        state = replace(state, points=np.where(swap[:, None], rivals, state.points))
+        _, direct = _support(everything, state)
+        reflected |= (swap | keep)[problem.sightings.label] & shown & ~direct
+    return state, reflected
+
+
+def _level(problem: Problem, state: State, rivals: Floats) -> Bools:
+    """(L,) labels whose rival position is as high as theirs; known labels are none: where they are was measured."""
+    level = np.abs(rivals[:, 2] - state.points[:, 2]) < _UPRIGHT_M
+    level[problem.known.label] = False
+    return level
+
+
+def _nearer(problem: Problem, state: State, rivals: Floats) -> Bools:
+    """(L,) labels whose rival position is nearer than theirs, on the plan, from every stop that saw them."""
+    return _compared(problem, state, state.points, rivals)
+
+
+def _farther(problem: Problem, state: State, rivals: Floats) -> Bools:
+    """(L,) the opposite: farther from every stop."""
+    return _compared(problem, state, rivals, state.points)
+
+
+def _compared(problem: Problem, state: State, far: Floats, near: Floats) -> Bools:
+    sightings = problem.sightings
+    at = problem.stop_entries(state)[sightings.stop, :2]
+    to_far = np.linalg.norm(far[sightings.label, :2] - at, axis=1)
+    to_near = np.linalg.norm(near[sightings.label, :2] - at, axis=1)
+    result = np.ones(len(far), dtype=np.bool_)
+    result[sightings.label[~(to_near < to_far)]] = False  # also where one of them is NaN: there is no rival
+    return result
+
+
+def _hypotheses(problem: Problem, state: State, without: Bools | None = None) -> tuple[Floats, Floats, Floats]:
     """Support of each label's position, the best position that its other sightings propose, and that one's support.
 
-    The support is the sum over groups of rivals of probability times (1 - squared residual / threshold).
+    Sightings `without` (N,) propose nothing. The support is the sum over groups of rivals of probability times
+    (1 - squared residual / threshold).
     """
     nothing = Known(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     fixed = replace(problem, prior_sigma=np.zeros_like(problem.prior_sigma), known=nothing)
     everything = Adjustment(fixed, problem.sightings)
     gain, explained_ = _support(everything, state)
-    rest = problem.sightings.select(~explained_)
+    rest = problem.sightings.select(~explained_ if without is None else ~(explained_ | without))
     count = len(problem.labels)
     none = np.full((count, 3), np.nan), np.zeros(count)
     if len(rest) == 0:
