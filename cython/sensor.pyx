@@ -4,11 +4,15 @@
 """
 
 from libc.math cimport acos, asin, fabs, floor, sqrt
-from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, uint64_t
+from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 from libc.stdlib cimport free, malloc
+
+cdef extern from *:
+    void fetch "__builtin_prefetch"(const void* at) nogil
 
 cdef enum:
     QUAD = 15  # numbers in a row of `quads`
+    BLOCK = 4  # rows and columns of a block of `cover`
 
 
 cdef inline double dot(const double* a, const double* b) noexcept nogil:
@@ -282,29 +286,61 @@ cdef inline float texel_at(
     return top + fy * (bottom - top)
 
 
+cdef inline uint64_t texel(const uint8_t* p) noexcept nogil:
+    """Coverage in the lower and reflectance in the upper half, so that both are blended at once."""
+    return p[0] | (<uint64_t> p[1] << 32)
+
+
 cdef bint paint_tile(
-    float[:, ::1] linear, const float[:, ::1] depth, const uint8_t* picture, int64_t w, int64_t h, const float* fx,
-    const float* fy, const float* t, float light, int64_t r0, int64_t r1, int64_t c0, int64_t c1, int32_t* box
+    float[:, ::1] linear, const float[:, ::1] depth, const uint8_t* picture, int64_t w, int64_t h, const double* fx,
+    const double* fy, const double* t, bint hidden, double light, int64_t r0, int64_t r1, int64_t c0, int64_t c1,
+    int32_t* box
 ) noexcept nogil:
-    """Paint a walker into one tile, given places in the picture and depths at the tile's corners."""
-    cdef int64_t r, c, top = r1, bottom = r0, left = c1, right = c0
-    cdef float a, x, y, z, dx, dy, dz, alpha, tone
-    cdef float rows = 1.0 / <float> (r1 - r0), columns = 1.0 / <float> (c1 - c0)
+    """Paint a walker into one tile, given places in the picture and depths at the tile's corners.
+
+    `hidden` says whether parts of it may be behind something.
+    """
+    cdef int64_t r, c, x, y, dx, dy, top = r1, bottom = r0, left = c1, right = c0
+    cdef double a, x0, y0, z0, rows = 1.0 / (r1 - r0), columns = 1.0 / (c1 - c0)
+    cdef uint64_t across = <uint64_t> (w - 1) << 32, down = <uint64_t> (h - 1) << 32
+    cdef uint64_t p, q, part
+    cdef float z, dz, alpha
+    cdef float full = <float> (1.0 / (255.0 * 16777216.0)), tone = <float> (light / (255.0 * 16777216.0))
+    cdef const uint8_t* at
+    for r in range(r0, r1):  # of rows so far apart none is at hand unless they are called for at once
+        fetch(&linear[r, c0])
+        fetch(&linear[r, c1 - 1])
+        if hidden:
+            fetch(&depth[r, c0])
+            fetch(&depth[r, c1 - 1])
     for r in range(r0, r1):
-        a = (r - r0 + <float> 0.5) * rows
-        x = fx[0] + a * (fx[2] - fx[0])
-        y = fy[0] + a * (fy[2] - fy[0])
-        z = t[0] + a * (t[2] - t[0])
-        dx = (fx[1] + a * (fx[3] - fx[1]) - x) * columns
-        dy = (fy[1] + a * (fy[3] - fy[1]) - y) * columns
-        dz = (t[1] + a * (t[3] - t[1]) - z) * columns
+        a = (r - r0 + 0.5) * rows
+        x0 = fx[0] + a * (fx[2] - fx[0])
+        y0 = fy[0] + a * (fy[2] - fy[0])
+        z0 = t[0] + a * (t[2] - t[0])
+        dx = <int64_t> ((fx[1] + a * (fx[3] - fx[1]) - x0) * columns * 4294967296.0)  # 32 binary digits
+        dy = <int64_t> ((fy[1] + a * (fy[3] - fy[1]) - y0) * columns * 4294967296.0)
+        dz = <float> ((t[1] + a * (t[3] - t[1]) - z0) * columns)
+        x = <int64_t> (x0 * 4294967296.0) - (dx >> 1)
+        y = <int64_t> (y0 * 4294967296.0) - (dy >> 1)
+        z = <float> z0 - <float> 0.5 * dz
         for c in range(c0, c1):
-            a = c - c0 + <float> 0.5
-            alpha = texel_at(picture, w, h, x + a * dx, y + a * dy, &tone)
-            if alpha <= 0.0 or z + a * dz >= depth[r, c]:
+            x += dx
+            y += dy
+            z += dz
+            if <uint64_t> x >= across or <uint64_t> y >= down:
                 continue
-            alpha = alpha / <float> 255.0
-            linear[r, c] += alpha * (tone * light - linear[r, c])
+            at = picture + 2 * ((y >> 32) * w + (x >> 32))
+            if not (at[0] | at[2] | at[2 * w] | at[2 * w + 2]) or (hidden and z >= depth[r, c]):
+                continue
+            part = (x >> 20) & 4095
+            p = texel(at)
+            p = (p << 12) + (texel(at + 2) - p) * part
+            q = texel(at + 2 * w)
+            q = (q << 12) + (texel(at + 2 * w + 2) - q) * part
+            p = (p << 12) + (q - p) * <uint64_t> ((y >> 20) & 4095)
+            alpha = <float> <uint32_t> p * full
+            linear[r, c] += alpha * (<float> <uint32_t> (p >> 32) * tone - linear[r, c])
             top = min(top, r)
             bottom = r + 1
             left = min(left, c)
@@ -316,20 +352,41 @@ cdef bint paint_tile(
     return bottom > top
 
 
+cdef inline bint covered(
+    const uint8_t* cover, int64_t w, int64_t h, const double* fx, const double* fy
+) noexcept nogil:
+    """Whether anything of a picture is between these corners; `cover` is its greatest coverage per block."""
+    cdef int64_t x, y
+    cdef int64_t x0 = <int64_t> max(min(min(fx[0], fx[1]), min(fx[2], fx[3])), 0.0)
+    cdef int64_t y0 = <int64_t> max(min(min(fy[0], fy[1]), min(fy[2], fy[3])), 0.0)
+    cdef int64_t x1 = <int64_t> max(min(max(max(fx[0], fx[1]), max(fx[2], fx[3])), w - 1.0), -1.0)
+    cdef int64_t y1 = <int64_t> max(min(max(max(fy[0], fy[1]), max(fy[2], fy[3])), h - 1.0), -1.0)
+    for y in range(y0 // BLOCK, (y1 + BLOCK) // BLOCK):
+        for x in range(x0 // BLOCK, (x1 + BLOCK) // BLOCK):
+            if cover[y * (w // BLOCK) + x]:
+                return True
+    return False
+
+
 def paint_walkers(
-    float[:, ::1] linear, const float[:, ::1] depth, const float[:, :, ::1] rays, const double[:, ::1] T_store_camera,
-    const double[:, ::1] walkers, const uint8_t[::1] sprites, const int64_t[:, ::1] levels, const double[:, ::1] spans,
-    double row_time, int32_t[:, ::1] boxes
+    float[:, ::1] linear, const float[:, ::1] depth, const float[:, :, ::1] reach, const float[:, :, ::1] rays,
+    const double[:, ::1] T_store_camera, const double[:, ::1] walkers, const uint8_t[::1] sprites,
+    const int64_t[:, ::1] levels, const uint8_t[::1] cover, double row_time, int32_t[:, ::1] boxes
 ):
     cdef int64_t height = linear.shape[0], width = linear.shape[1], used = 0
-    cdef int64_t k, r0, c0, r1, c1, r, c, i, level, picture, h, w, ahead
+    cdef int64_t tiles = (width + 15) // 16, k, i, j, r, c, side, level, picture, h, w
     cdef double d[3]
-    cdef float fx[4]
-    cdef float fy[4]
-    cdef float depths[4]
+    cdef double fx[4]
+    cdef double fy[4]
+    cdef double t[4]
     cdef double ox = T_store_camera[0, 3], oy = T_store_camera[1, 3], oz = T_store_camera[2, 3]
-    cdef double reach, t, s, z, s0, s1, z0, z1, low, high, pixel
+    cdef double ahead, near, pixel, s
     cdef Board board
+    # column, row and depth of the corners above and below a row of tiles
+    cdef double* corners = <double*> malloc(6 * (tiles + 1) * sizeof(double))
+    cdef double* corner
+    if corners == NULL:
+        raise MemoryError
     with nogil:
         for k in range(walkers.shape[0]):
             if not face(&walkers[k, 0], ox, oy, &board):
@@ -340,54 +397,52 @@ def paint_walkers(
                 level += 1
             h = levels[level, 1]
             w = levels[level, 2]
-            picture = <int64_t> walkers[k, 7] * levels[level, 3] + board.picture
-            low = -spans[picture, 1] if board.mirrored else spans[picture, 0]
-            high = -spans[picture, 0] if board.mirrored else spans[picture, 1]
-            picture = 2 * (levels[level, 0] + picture * h * w)
-            for r0 in range(0, height, 16):
-                r1 = min(r0 + 16, height)
-                for c0 in range(0, width, 16):
-                    c1 = min(c0 + 16, width)
-                    s0 = 1e9
-                    s1 = -1e9
-                    z0 = 1e9
-                    z1 = -1e9
-                    ahead = 0
-                    for i in range(4):
-                        r = r0 if i < 2 else r1
-                        c = c0 if i % 2 == 0 else c1
-                        direction(T_store_camera, rays[r, c, 0], rays[r, c, 1], d)
-                        reach = d[0] * board.nx + d[1] * board.ny
-                        if reach <= 0.02:
-                            break
-                        ahead += 1
-                        t = board.distance / reach
-                        s = (t * (d[0] * board.ex + d[1] * board.ey) - board.drift * row_time * r) / board.half
-                        z = (oz + t * d[2]) / board.height
-                        s0 = min(s0, s)
-                        s1 = max(s1, s)
-                        z0 = min(z0, z)
-                        z1 = max(z1, z)
-                        fx[i] = <float> ((0.5 - 0.5 * s if board.mirrored else 0.5 + 0.5 * s) * w - 0.5)
-                        fy[i] = <float> ((1.0 - z) * h - 0.5)
-                        depths[i] = <float> t
-                    if ahead < 4 or used >= boxes.shape[0] or s0 > high or s1 < low or z0 > 1.0 or z1 < 0.0:
+            picture = levels[level, 0] + (<int64_t> walkers[k, 7] * levels[level, 3] + board.picture) * h * w
+            side = 0
+            for i in range((height + 15) // 16 + 1):
+                r = min(16 * i, height)
+                side = 1 - side
+                corner = corners + 3 * (tiles + 1) * side
+                for j in range(tiles + 1):
+                    c = min(16 * j, width)
+                    direction(T_store_camera, rays[r, c, 0], rays[r, c, 1], d)
+                    ahead = d[0] * board.nx + d[1] * board.ny
+                    corner[2] = board.distance / ahead if ahead > 0.02 else -1.0
+                    s = (corner[2] * (d[0] * board.ex + d[1] * board.ey) - board.drift * row_time * r) / board.half
+                    corner[0] = (0.5 - 0.5 * s if board.mirrored else 0.5 + 0.5 * s) * w - 0.5
+                    corner[1] = (1.0 - (oz + corner[2] * d[2]) / board.height) * h - 0.5
+                    corner += 3
+                if i == 0:
+                    continue
+                for j in range(tiles):
+                    for c in range(4):
+                        corner = corners + 3 * ((tiles + 1) * (1 - side if c < 2 else side) + j + c % 2)
+                        fx[c] = corner[0]
+                        fy[c] = corner[1]
+                        t[c] = corner[2]
+                    near = min(min(t[0], t[1]), min(t[2], t[3]))
+                    if near < 0.0 or near >= reach[i - 1, j, 1] or used >= boxes.shape[0]:
                         continue
-                    used += paint_tile(linear, depth, &sprites[picture], w, h, fx, fy, depths,
-                                       <float> (board.light / 255.0), r0, r1, c0, c1, &boxes[used, 0])
+                    if covered(&cover[picture // (BLOCK * BLOCK)], w, h, fx, fy):
+                        used += paint_tile(linear, depth, &sprites[2 * picture], w, h, fx, fy, t,
+                                           max(max(t[0], t[1]), max(t[2], t[3])) >= reach[i - 1, j, 0], board.light,
+                                           16 * i - 16, r, 16 * j, min(16 * j + 16, width), &boxes[used, 0])
+    free(corners)
     return used
 
 
 def transmission(
-    const double[:, ::1] origins, const double[:, ::1] targets, const double[::1] delays,
-    const double[:, ::1] walkers, const uint8_t[::1] sprites, const int64_t[:, ::1] levels, double[::1] out
+    const double[:, ::1] origins, const double[:, ::1] targets, const double[::1] delays, const int64_t[::1] spots,
+    const double[:, ::1] walkers, const uint8_t[::1] sprites, const int64_t[:, ::1] levels, double[:, ::1] strength
 ):
     cdef int64_t i, k, picture
-    cdef double dx, dy, reach, t, s, z
+    cdef double dx, dy, reach, t, s, z, passed
     cdef float light = 0.0
     cdef Board board
     with nogil:
         for i in range(origins.shape[0]):
+            if strength[0, spots[i]] <= 0.0 and strength[1, spots[i]] <= 0.0:
+                continue
             for k in range(walkers.shape[0]):
                 if not face(&walkers[k, 0], origins[i, 0], origins[i, 1], &board):
                     continue
@@ -403,26 +458,62 @@ def transmission(
                     s = -s
                 picture = levels[0, 0] + (<int64_t> walkers[k, 7] * levels[0, 3] + board.picture) \
                     * levels[0, 1] * levels[0, 2]
-                out[i] *= 1.0 - texel_at(&sprites[2 * picture], levels[0, 2], levels[0, 1],
-                                         <float> ((0.5 + 0.5 * s) * levels[0, 2] - 0.5),
-                                         <float> ((1.0 - z) * levels[0, 1] - 0.5), &light) / 255.0
+                passed = 1.0 - texel_at(&sprites[2 * picture], levels[0, 2], levels[0, 1],
+                                        <float> ((0.5 + 0.5 * s) * levels[0, 2] - 0.5),
+                                        <float> ((1.0 - z) * levels[0, 1] - 0.5), &light) / 255.0
+                strength[0, spots[i]] *= passed
+                strength[1, spots[i]] *= passed
+
+
+cdef inline double whole_turns(double turns, double duty) noexcept nogil:
+    """How long a light with this duty has been on after so many turns, in turns."""
+    cdef double whole = floor(turns)
+    return whole * duty + min(turns - whole, duty)
+
+
+def shine(
+    const double[::1] light, const int64_t[:, ::1] pick, const double[:, ::1] blink, const double[:, ::1] ends,
+    const double[::1] peak, double t, double exposure, double row_time, double[:, ::1] strength
+):
+    cdef int64_t i, k
+    cdef double begin, share, frequency
+    with nogil:
+        for k in range(2):
+            for i in range(peak.shape[0]):
+                frequency = blink[i, 0]
+                if pick[k, i] >= 0:
+                    share = light[pick[k, i]]
+                elif frequency > 0.0:
+                    begin = (t + row_time * ends[i, k]) * frequency
+                    share = whole_turns(begin + exposure * frequency, blink[i, 1]) - whole_turns(begin, blink[i, 1])
+                    share = share / max(exposure * frequency, 1e-12)
+                else:
+                    share = 1.0
+                strength[k, i] = share * peak[i]
 
 
 def add_lights(
     float[:, ::1] linear, const int32_t[:, ::1] boxes, const float[:, ::1] across, const float[:, ::1] down,
-    const double[::1] top, const double[::1] bottom, const float[::1] gain
+    const double[:, ::1] strength, const float[::1] gain, int32_t[:, ::1] changed
 ):
-    cdef int64_t i, r, c, rows
-    cdef double strength
+    cdef int64_t i, r, c, rows, k, used = 0
+    cdef double here
     cdef float row
     with nogil:
         for i in range(boxes.shape[0]):
+            if strength[0, i] <= 1e-5 and strength[1, i] <= 1e-5:
+                continue
             rows = boxes[i, 1] - boxes[i, 0]
             for r in range(boxes[i, 0], boxes[i, 1]):
-                strength = top[i] + (bottom[i] - top[i]) * (r - boxes[i, 0]) / (rows - 1 if rows > 1 else 1)
-                row = <float> (strength * down[i, r - boxes[i, 0]] / gain[r])
+                here = strength[0, i] + (strength[1, i] - strength[0, i]) * (r - boxes[i, 0]) / (
+                    rows - 1 if rows > 1 else 1)
+                row = <float> (here * down[i, r - boxes[i, 0]] / gain[r])
                 for c in range(boxes[i, 2], boxes[i, 3]):
                     linear[r, c] += row * across[i, c - boxes[i, 2]]
+            for k in range(4):
+                changed[used, k] = boxes[i, k]
+            used += 1
+    return used
 
 
 cdef inline uint64_t start_of_row(uint64_t seed, uint64_t row, uint64_t mask) noexcept nogil:
@@ -458,7 +549,8 @@ def expose(
     const int16_t[:, ::1] level, const uint8_t[:, ::1] sigma, const int32_t[::1] gain, const int8_t[::1] bank,
     uint64_t mask, uint64_t seed, uint8_t[:, ::1] out
 ):
-    cdef int64_t height = level.shape[0], width = level.shape[1], r
+    cdef int64_t height = level.shape[0], width = level.shape[1], r, c
+    cdef uint64_t start = start_of_row(seed, 0, mask), following
     cdef const int16_t* row
     cdef int16_t* scaled = <int16_t*> malloc(width * sizeof(int16_t))
     if scaled == NULL:
@@ -466,34 +558,50 @@ def expose(
     with nogil:
         for r in range(height):
             row = &level[r, 0]
+            following = start_of_row(seed, r + 1, mask)
+            for c in range(0, width, 64):  # rows begin anywhere in the bank
+                fetch(&bank[following + c])
             if gain[r] != 16384:
                 scale_row(row, gain[r], scaled, width)
                 row = scaled
-            expose_row(row, &sigma[r, 0], &bank[start_of_row(seed, r, mask)], &out[r, 0], width)
+            expose_row(row, &sigma[r, 0], &bank[start], &out[r, 0], width)
+            start = following
     free(scaled)
 
 
 def retouch(
-    float[:, ::1] linear, const float[:, ::1] still, const int32_t[:, ::1] boxes, const int16_t[::1] level_of,
-    const uint8_t[::1] sigma_of, double scale, const float[::1] gain, const int8_t[::1] bank, uint64_t mask,
-    uint64_t seed, uint8_t[:, ::1] out
+    float[:, ::1] linear, const float[:, ::1] still, const int32_t[:, ::1] boxes, const int32_t[::1] code_of,
+    double scale, const float[::1] gain, const int8_t[::1] bank, uint64_t mask, uint64_t seed, uint8_t[:, ::1] out
 ):
-    cdef int64_t last = level_of.shape[0] - 1, i, r, c
+    cdef int64_t last = code_of.shape[0] - 1, i, r, c
     cdef const int8_t* noise
     cdef float factor, value
-    cdef int32_t entry, v
+    cdef int32_t v
+    cdef uint64_t* starts = <uint64_t*> malloc(out.shape[0] * sizeof(uint64_t))
+    if starts == NULL:
+        raise MemoryError
     with nogil:
+        for r in range(out.shape[0]):
+            starts[r] = start_of_row(seed, r, mask)
         for i in range(boxes.shape[0]):
+            if i + 1 < boxes.shape[0]:
+                c = boxes[i + 1, 2]
+                for r in range(boxes[i + 1, 0], boxes[i + 1, 1]):
+                    fetch(&bank[starts[r] + c])
+                    fetch(&out[r, c])
+                    fetch(&still[r, c])
+                    fetch(&linear[r, c])
             for r in range(boxes[i, 0], boxes[i, 1]):
-                noise = &bank[start_of_row(seed, r, mask)]
+                noise = &bank[starts[r]]
                 factor = <float> (scale * gain[r])
                 for c in range(boxes[i, 2], boxes[i, 3]):
                     value = linear[r, c] * factor
-                    entry = <int32_t> (value if value < last else last)
-                    v = level_of[entry] + ((<int32_t> sigma_of[entry] * noise[c]) >> 4)
+                    v = code_of[<int32_t> (value if value < last else last)]
+                    v = (v >> 8) + (((v & 255) * noise[c]) >> 4)
                     v = (v + 32) >> 6
                     out[r, c] = <uint8_t> (0 if v < 0 else (255 if v > 255 else v))
         for i in range(boxes.shape[0]):
             for r in range(boxes[i, 0], boxes[i, 1]):
                 for c in range(boxes[i, 2], boxes[i, 3]):
                     linear[r, c] = still[r, c]
+    free(starts)

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from robotd.geometry.transforms import pose_matrix, transform_record
 from robotd.records import CameraModel
 from robotd.sim import sensor
-from robotd.sim.camera import RigRenderer, SensorSettings, distort, on_share, undistorted_grid
+from robotd.sim.camera import RigRenderer, SensorSettings, distort, undistorted_grid
 from robotd.sim.scene import NOISE_BANK, Scene
+from robotd.sim.sensor import on_share
 from robotd.sim.stores import (
     Blinker,
     Floor,

@@ -76,12 +76,23 @@ def test_painting_walkers_agrees_with_numpy(t):
     world = busy()
     rays = grid(320, 240)
     depth = np.full((240, 320), 1.9, np.float32)
+    depth[:, :150] = 1.3
     people, crowd = world.people(t), world.crowd
     results = []
     for module in (kernel, sensor):
         linear, boxes = np.full((240, 320), 0.1, np.float32), np.zeros((600, 4), np.int32)
         used = module.paint_walkers(
-            linear, depth, rays, T_STORE_CAMERA, people, crowd.sprites, crowd.levels, crowd.spans, 6e-5, boxes
+            linear,
+            depth,
+            sensor.reach(depth),
+            rays,
+            T_STORE_CAMERA,
+            people,
+            crowd.sprites,
+            crowd.levels,
+            crowd.cover,
+            6e-5,
+            boxes,
         )
         results.append((linear, boxes[:used]))
     assert len(results[0][1]) > 10
@@ -92,14 +103,34 @@ def test_painting_walkers_agrees_with_numpy(t):
     assert not ((results[0][0] != np.float32(0.1)) & ~inside).any()
 
 
+@pytest.mark.parametrize("t", [0.3, 0.9, 2.7])
+def test_what_painting_skips_would_have_changed_nothing(t):
+    world = busy()
+    rays = grid(320, 240)
+    depth = np.random.default_rng(1).uniform(1.0, 2.0, (15, 20)).repeat(16, 0).repeat(16, 1).astype(np.float32)
+    depth[:, ::7] = 1.2
+    people, crowd = world.people(t), world.crowd
+    anywhere = np.broadcast_to(np.array([0.0, np.inf], np.float32), (15, 20, 2)).copy()
+    results = []
+    for cover, reach in ((crowd.cover, sensor.reach(depth)), (np.full_like(crowd.cover, 255), anywhere)):
+        linear, boxes = np.full((240, 320), 0.1, np.float32), np.zeros((600, 4), np.int32)
+        used = kernel.paint_walkers(
+            linear, depth, reach, rays, T_STORE_CAMERA, people, crowd.sprites, crowd.levels, cover, 6e-5, boxes
+        )
+        results.append((linear, boxes[:used]))
+    for found, expected in zip(*results, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_light_past_walkers_agrees_with_numpy():
     world, rng = busy(), np.random.default_rng(5)
     people, crowd = world.people(0.9), world.crowd
     origins = np.tile([1.0, 2.0, 0.5], (300, 1))
     targets = np.column_stack([np.full(300, 3.8), rng.uniform(1.0, 3.0, 300), rng.uniform(0.2, 1.8, 300)])
-    passed = np.ones((2, 300))
+    spots = np.arange(300)[::-1] // 2  # two legs each
+    passed = np.ones((2, 2, 150))
     for module, out in zip((kernel, sensor), passed, strict=True):
-        module.transmission(origins, targets, np.zeros(300), people, crowd.sprites, crowd.levels, out)
+        module.transmission(origins, targets, np.zeros(300), spots, people, crowd.sprites, crowd.levels, out)
     assert passed[0].min() < 0.05 < 0.95 < passed[0].max()
     np.testing.assert_allclose(passed[0], passed[1], atol=1e-3)
 
@@ -126,18 +157,33 @@ def test_retouching_with_lights_agrees_with_numpy(seed):
     starts = rng.integers(0, (45, 65), (6, 2))
     boxes = np.column_stack([starts[:, 0], starts[:, 0] + 13, starts[:, 1], starts[:, 1] + 13]).astype(np.int32)
     across, down = rng.uniform(0.0, 1.0, (2, 6, 32)).astype(np.float32)
-    top, bottom = rng.uniform(0.0, 0.5, (2, 6))
+    strength = rng.uniform(0.0, 0.5, (2, 6))
+    strength[:, 2] = 0.0
     gain = rng.uniform(0.7, 1.3, 60).astype(np.float32)
-    level_of = np.arange(16384).astype(np.int16)
-    sigma_of = np.full(16384, 64, np.uint8)
+    code_of = 256 * np.arange(16384, dtype=np.int32) + 64
     bank = rng.integers(-127, 128, 4096 + 128).astype(np.int8)
     results = []
     for module in (kernel, sensor):
         linear, out = still.copy(), np.zeros((60, 80), np.uint8)
-        module.add_lights(linear, boxes, across, down, top, bottom, gain)
+        changed = np.zeros_like(boxes)
+        assert module.add_lights(linear, boxes, across, down, strength, gain, changed) == 5
+        np.testing.assert_array_equal(changed[:5], np.delete(boxes, 2, axis=0))
         lit = linear.copy()
-        module.retouch(linear, still, boxes, level_of, sigma_of, 9000.0, gain, bank, 4095, seed, out)
+        module.retouch(linear, still, boxes, code_of, 9000.0, gain, bank, 4095, seed, out)
         np.testing.assert_array_equal(linear, still)
         results.append((lit, out))
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-6)
     assert np.abs(results[0][1].astype(int) - results[1][1]).max() <= 1
+
+
+@given(st.integers(0, 2**64 - 1))
+@settings(max_examples=15, deadline=None)
+def test_strength_of_lights_agrees_with_numpy(seed):
+    rng = np.random.default_rng(seed)
+    pick = rng.integers(-1, 40, (2, 30))
+    blink = np.column_stack([rng.choice([0.0, 0.7, 5.0], 30), rng.uniform(0.0, 1.0, 30)])
+    args = rng.uniform(0.0, 1.0, 40), pick, blink, rng.uniform(0.0, 480.0, (30, 2)), rng.uniform(0.0, 2.0, 30)
+    out, t = np.empty((2, 2, 30)), rng.uniform(0.0, 60.0)
+    for module, strength in zip((kernel, sensor), out, strict=True):
+        module.shine(*args, t, 0.01, 6e-5, strength)
+    np.testing.assert_allclose(out[0], out[1], atol=1e-9)

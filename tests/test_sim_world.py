@@ -168,6 +168,18 @@ def test_poses_are_remembered() -> None:
 # ---- floor camera ----------------------------------------------------------------------------------------------------
 
 
+def test_place_in_space_is_computed_once_per_standstill_and_follows_the_wheels() -> None:
+    body = _body(SETTINGS)
+    end = _drive(body, 0.2, 0.3, 0.6)
+    standing = _drive(body, 0.0, 0.0, 0.6, end)
+    T = body.T_store_robot(standing)
+    assert body.T_store_robot(standing - 0.31) is T
+    for t in (end - 0.2, standing):
+        np.testing.assert_array_equal(body.T_store_robot(t), body.transform(body.pose_at(t)))
+    with pytest.raises(ValueError, match="read-only"):
+        T[0, 3] = 0.0
+
+
 def _project(points: Floats, T_store_robot: Floats, camera: CameraModel) -> Floats:
     T_camera_store = invert_rigid(T_store_robot @ transform_matrix(camera.T_robot_camera))
     fx, fy, cx, cy = camera.matrix

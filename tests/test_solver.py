@@ -745,3 +745,19 @@ def test_the_linear_method_uses_odometry_as_it_is():
     assert evaluate(result, truth).error_mm["max"] < 0.01
     noisy, truth = noisy_room()
     assert evaluate(solve(noisy, "linear"), truth).error_mm["mean"] > 20.0
+
+
+def test_an_image_is_not_placed_when_one_sighting_puts_the_label_in_front_of_the_glass():
+    survey, truth = quiet_room()
+    both = reflected(survey, truth, "S04", [s.stop for s in survey.stops])
+    first = next(s.stop for s in survey.stops if any(g.label == "S04" for g in s.sightings))
+
+    def the_image_and_one_look(stop):
+        mine = [s for s in stop.sightings if s.label == "S04"]
+        direct = mine[:-1] if stop.stop != first else []  # the image is the last one
+        return [s for s in stop.sightings if not any(s is d for d in direct)]
+
+    label = label_of(solve(with_sightings(both, the_image_and_one_look)), "S04")
+    assert (label.status, label.position) == ("ambiguous", None)
+    assert min(np.linalg.norm(np.subtract(c.position, truth["S04"])) for c in label.candidates) < 0.01
+    assert "image in glass" in label.reason

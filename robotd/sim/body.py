@@ -88,6 +88,7 @@ class Body:
         self._to_slip = [0.0, 0.0]  # rim metres of each wheel that still slip
         self._next_slip = self._draw_slip()
         self._moving = False
+        self._stood: tuple[Pose, Floats] | None = None  # where `T_store_robot` last was, and its answer
         self._history: deque[tuple[float, float, float, float]] = deque([(0.0, start.x, start.y, start.heading)])
         self._trail = [(0.0, start.x, start.y, start.heading)]
 
@@ -156,8 +157,16 @@ class Body:
         return _interpolated(self._trail, t)
 
     def T_store_robot(self, t: float) -> Floats:
-        """(4, 4) pose in space at `t`: heading about the vertical, then the floor's roll and pitch there; z is 0."""
-        return self.transform(self.pose_at(t))
+        """(4, 4) pose in space at `t`: heading about the vertical, then the floor's roll and pitch there; z is 0.
+
+        Read-only, and the same array as long as the robot stands still.
+        """
+        pose = self.pose_at(t)
+        if self._stood is None or pose != self._stood[0]:
+            T = self.transform(pose)
+            T.flags.writeable = False
+            self._stood = pose, T
+        return self._stood[1]
 
     def transform(self, pose: Pose) -> Floats:
         """(4, 4) transform from robot to store axes of a body that stands at `pose`."""

@@ -7,8 +7,9 @@ fresh noise, and where people or lights are, the same done again with them in it
 from __future__ import annotations
 
 import functools
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -19,12 +20,12 @@ from ..bind import ranged
 from ..geometry.transforms import transform_matrix
 from ..records import CameraModel, Floats
 from .scene import LED_SIGMA, NOISE_BANK, Scene
-from .sensor import DN_STEPS, SIGMA_STEPS, UNITY
+from .sensor import DN_STEPS, SIGMA_STEPS, TILE, UNITY, reach
 
 try:
-    from ._sensor import add_lights, expose, paint_walkers, retouch, trace, transmission
+    from ._sensor import add_lights, expose, paint_walkers, retouch, shine, trace, transmission
 except ImportError:
-    from .sensor import add_lights, expose, paint_walkers, retouch, trace, transmission
+    from .sensor import add_lights, expose, paint_walkers, retouch, shine, trace, transmission
 
 Lit = Callable[[Floats, Floats], Floats]
 
@@ -33,6 +34,7 @@ BRIGHTEST = 1.5  # radiance at which the tables end: 306 grey levels, above whic
 TABLE = 1 << 15
 PATCH = 32  # most rows and columns of a light's picture
 REACH = 5.0  # standard deviations to which a light's picture extends
+_NO_LIGHT: Floats = np.zeros(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,34 +104,27 @@ def distort(camera: CameraModel, xy: Floats) -> Floats:
     )
 
 
-def on_share(t0: Floats, t1: Floats, frequency: Floats, duty: Floats) -> Floats:
-    """Share of [t0, t1] in which a light that blinks at `frequency` with this `duty` is on."""
-    turns0, turns1 = t0 * frequency, t1 * frequency
-    on = (np.floor(turns1) - np.floor(turns0)) * duty + np.minimum(turns1 % 1.0, duty) - np.minimum(turns0 % 1.0, duty)
-    return np.asarray(np.where(frequency > 0.0, on / np.maximum(turns1 - turns0, 1e-12), 1.0))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Spots:
     """The N lights that the camera sees from its present pose, directly or in glass.
 
-    A label may be seen several times; its spots are in different layers. Light comes along legs: the first N
+    Light comes along legs: the first N
     lead from the eye to the lights or to the glass, the others from the glass to the lights.
     """
 
-    label: NDArray[np.int64]  # index in the layout, -1 for a blinker
-    layer: NDArray[np.int64]
-    layers: int
+    delays: Floats  # (K, L) of the rows at which the labels are looked at, in seconds
+    pick: NDArray[np.int64]  # where in these each spot's first and last row are, -1 for a blinker
     blink: Floats
-    strength: Floats  # peak radiance when on for the whole base exposure
+    peak: Floats  # radiance when on for the whole base exposure
     boxes: NDArray[np.int32]
     across: NDArray[np.float32]
     down: NDArray[np.float32]
-    row: Floats
     ends: Floats  # first and last row of the box
+    strength: Floats  # (2, N) scratch: radiance in those rows
     leg_from: Floats
     leg_to: Floats
     leg_of: NDArray[np.int64]
+    leg_delays: Floats
 
 
 class RigRenderer:
@@ -161,7 +156,7 @@ class RigRenderer:
         self._depth = np.zeros((height, width), np.float32)
         self._level = np.zeros((height, width), np.int16)
         self._sigma = np.zeros((height, width), np.uint8)
-        self._boxes = np.zeros((4 * (-(-height // 16)) * (-(-width // 16)), 4), np.int32)
+        self._tiles = -(-height // TILE) * -(-width // TILE)
         self._steady = np.full(height, UNITY, np.int32), np.ones(height, np.float32)
         self._T_store_robot: Floats | None = None
         self._exposure = 0.0
@@ -169,8 +164,8 @@ class RigRenderer:
         light = (np.arange(TABLE) + 0.5) * BRIGHTEST / TABLE
         grey = 255.0 * light ** (1.0 / settings.gamma)
         noise = np.sqrt(settings.read_noise**2 + settings.shot_noise * np.minimum(grey, 255.0))
-        self._level_of = np.rint(grey * DN_STEPS).astype(np.int16)
-        self._sigma_of = np.clip(np.rint(noise * SIGMA_STEPS), 0, 255).astype(np.uint8)
+        level, sigma = np.rint(grey * DN_STEPS), np.clip(np.rint(noise * SIGMA_STEPS), 0, 255)
+        self._code_of = (256.0 * level + sigma).astype(np.int32)
 
     def render(self, T_store_robot: Floats, t: float, exposure: float, lit: Lit, noise_seed: int) -> NDArray[np.uint8]:
         """One frame.
@@ -209,8 +204,7 @@ class RigRenderer:
                     self._linear,
                     self._still,
                     boxes,
-                    self._level_of,
-                    self._sigma_of,
+                    self._code_of,
                     self._scale,
                     linear_gain,
                     self.scene.noise,
@@ -237,33 +231,38 @@ class RigRenderer:
         )
         self._still[:] = cv2.GaussianBlur(sharp, (0, 0), self.settings.blur, borderType=cv2.BORDER_REPLICATE)
         self._linear[:] = self._still
+        self._reach = reach(self._depth)
         self._spots = self._find_spots()
+        self._boxes = np.zeros((4 * self._tiles + len(self._spots.peak), 4), np.int32)
         self._T_store_robot = T_store_robot
 
     def _encode(self, exposure: float) -> None:
         self._scale = exposure / BASE_EXPOSURE * TABLE / BRIGHTEST
-        entry = np.minimum(self._still * np.float32(self._scale), TABLE - 1).astype(np.int32)
-        self._level[:] = self._level_of[entry]
-        self._sigma[:] = self._sigma_of[entry]
+        code = self._code_of[np.minimum(self._still * np.float32(self._scale), TABLE - 1).astype(np.int32)]
+        self._level[:] = code >> 8
+        self._sigma[:] = code & 255
+        self._swings = list(self._find_swings(exposure))
         self._exposure = exposure
 
-    def _flicker(self, t: float, exposure: float) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Gain of the rows, encoded and linear: the mean of the lamps' light over each row's exposure.
+    def _find_swings(self, exposure: float) -> Iterator[tuple[float, float]]:
+        """Angular frequency and depth of every part of the lamps' light that flickers in pictures so exposed.
 
         The mean of 1 + m cos(2 pi f t) over [t, t + e] is 1 + m sinc(f e) cos(2 pi f (t + e / 2)): no bands when the
         exposure is a multiple of the period.
         """
         lamps = self.scene.layout.lamps
         total = sum(lamp.brightness for lamp in lamps)
-        swing = np.zeros(len(self._linear))
         for lamp in lamps:
             depth = lamp.flicker * np.sinc(lamp.frequency * exposure) * self.settings.lamp_share * lamp.brightness
             if lamp.frequency > 0.0 and abs(depth) > 1e-6 * total:
-                middle = t + 0.5 * exposure + self._row_time * np.arange(len(swing))
-                swing += depth / total * np.cos(2.0 * np.pi * lamp.frequency * middle)
-        if not swing.any():
+                yield 2.0 * math.pi * lamp.frequency, float(depth / total)
+
+    def _flicker(self, t: float, exposure: float) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Gain of the rows, encoded and linear: the mean of the lamps' light over each row's exposure."""
+        if not self._swings:
             return self._steady
-        linear = np.maximum(1.0 + swing, 0.0)
+        middle = t + 0.5 * exposure + self._row_time * np.arange(len(self._linear))
+        linear = np.maximum(1.0 + sum(depth * np.cos(turn * middle) for turn, depth in self._swings), 0.0)
         encoded = np.rint(UNITY * linear ** (1.0 / self.settings.gamma)).astype(np.int32)
         return encoded, np.maximum(linear, 1e-3).astype(np.float32)
 
@@ -278,46 +277,38 @@ class RigRenderer:
             used = paint_walkers(
                 self._linear,
                 self._depth,
+                self._reach,
                 self._rays,
                 self._T_store_camera,
                 people,
                 crowd.sprites,
                 crowd.levels,
-                crowd.spans,
+                crowd.cover,
                 self._row_time,
-                self._boxes,
+                self._boxes[: 4 * self._tiles],
             )
-        if not len(spots.label):
+        if not len(spots.peak):
             return self._boxes[:used]
-        strength = self._shares(t, exposure, lit) * spots.strength
+        light = _NO_LIGHT
+        if spots.delays.size:
+            begins = t + spots.delays
+            light = np.ascontiguousarray(lit(begins, begins + exposure), dtype=np.float64).ravel()
+        shine(light, spots.pick, spots.blink, spots.ends, spots.peak, t, exposure, self._row_time, spots.strength)
         if used:
-            passed = np.ones(len(spots.leg_of))
-            delays = self._row_time * spots.row[spots.leg_of]
-            transmission(spots.leg_from, spots.leg_to, delays, people, crowd.sprites, crowd.levels, passed)
-            count = len(spots.label)
-            strength *= passed[:count]
-            strength[:, spots.leg_of[count:]] *= passed[count:]
-        on = np.flatnonzero(strength.max(axis=0) > 1e-5)
-        boxes = spots.boxes[on]
-        add_lights(self._linear, boxes, spots.across[on], spots.down[on], strength[0, on], strength[1, on], gain)
-        return np.concatenate([self._boxes[:used], boxes])
-
-    def _shares(self, t: float, exposure: float, lit: Lit) -> Floats:
-        """Share (2, N) of the exposure in which each spot is on, in the first and the last row of its box."""
-        spots = self._spots
-        shares = np.empty((2, len(spots.label)))
-        named = spots.label >= 0
-        if spots.layers:
-            label, layer = spots.label[named], spots.layer[named]
-            rows = np.full((spots.layers, 2, len(self.scene.layout.labels)), 0.5 * len(self._linear))
-            rows[layer, :, label] = spots.ends[named]
-            begins = t + self._row_time * rows.reshape(2 * spots.layers, -1)
-            light = lit(begins, begins + exposure).reshape(rows.shape)
-            shares[:, named] = light[layer, :, label].T
-        others = ~named
-        start = t + self._row_time * spots.ends[others].T
-        shares[:, others] = on_share(start, start + exposure, *spots.blink[others].T)
-        return shares
+            transmission(
+                spots.leg_from,
+                spots.leg_to,
+                spots.leg_delays,
+                spots.leg_of,
+                people,
+                crowd.sprites,
+                crowd.levels,
+                spots.strength,
+            )
+        used += add_lights(
+            self._linear, spots.boxes, spots.across, spots.down, spots.strength, gain, self._boxes[used:]
+        )
+        return self._boxes[:used]
 
     def _find_spots(self) -> _Spots:
         """Project every light that is in view, directly and in every glossy quad."""
@@ -364,28 +355,38 @@ class RigRenderer:
             np.exp(-0.5 * ((first[keep, i, None] + k - centre[keep, i, None]) / sigma[keep, None]) ** 2) for i in (0, 1)
         ]
         label = self.scene.lights.label[which[keep]]
+        ends = np.column_stack([first[keep, 1], last[keep, 1] - 1]).astype(np.float64)
+        # a label that is seen n times is asked about in n layers of two rows
         layer = np.array([int(np.sum(label[:n] == label[n])) for n in range(len(label))], np.int64)
+        named = np.flatnonzero(label >= 0)
+        layers, labels = int(layer[named].max(initial=-1)) + 1, len(self.scene.layout.labels)
+        rows = np.full((2 * layers, labels), 0.5 * height)
+        pick = np.full((2, len(label)), -1, np.int64)
+        for end in (0, 1):
+            rows[2 * layer[named] + end, label[named]] = ends[named, end]
+            pick[end, named] = (2 * layer[named] + end) * labels + label[named]
         # a leg from the eye to the light, or to the glass, and another from there to the light
         light, glass = self.scene.lights.position[which[keep]], via[keep]
         eye = np.tile(T[:3, 3], (len(light), 1))
         bent = np.flatnonzero(np.abs(glass - eye).max(axis=1) > 1e-9)
-        ends = light.copy()
-        ends[bent] = glass[bent]
+        seen = light.copy()
+        seen[bent] = glass[bent]
+        leg_of = np.concatenate([np.arange(len(light)), bent])
         peak = strength[keep] / distance[keep] ** 2 / sigma[keep] ** 2
         return _Spots(
-            label=label,
-            layer=layer,
-            layers=int(layer[label >= 0].max(initial=-1)) + 1,
+            delays=self._row_time * rows,
+            pick=pick,
             blink=self.scene.lights.blink[which[keep]],
-            strength=peak,
+            peak=peak,
             boxes=np.ascontiguousarray(
                 np.column_stack([first[keep, 1], last[keep, 1], first[keep, 0], last[keep, 0]]), dtype=np.int32
             ),
             across=np.ascontiguousarray(spread[0], dtype=np.float32),
             down=np.ascontiguousarray(spread[1], dtype=np.float32),
-            row=centre[keep, 1],
-            ends=np.column_stack([first[keep, 1], last[keep, 1] - 1]).astype(np.float64),
+            ends=ends,
+            strength=np.zeros((2, len(label))),
             leg_from=np.concatenate([eye, glass[bent]]),
-            leg_to=np.concatenate([ends, light[bent]]),
-            leg_of=np.concatenate([np.arange(len(light)), bent]),
+            leg_to=np.concatenate([seen, light[bent]]),
+            leg_of=leg_of,
+            leg_delays=self._row_time * centre[keep, 1][leg_of],
         )

@@ -107,6 +107,11 @@ class Scene:
         self._quads: list[Floats] = []
         self._pictures: list[surfaces.Picture] = []
         self._glowing: list[bool] = []
+        # coordinates (3, N, 1) and brightness (N, 1) of the lamps
+        self._lamps = (
+            np.ascontiguousarray(_rows([lamp.position for lamp in layout.lamps]).T)[..., None],
+            np.array([[lamp.brightness] for lamp in layout.lamps]).reshape(-1, 1),
+        )
         self._texel = self._texel_size(finest)
         self._build_room()
         self._build_fittings()
@@ -391,19 +396,18 @@ class Scene:
         crowd = self.crowd
         if not crowd.walkers:
             return np.empty((0, 9))
-        rows = crowd.at(t, np.zeros(len(crowd.walkers)))
+        rows = crowd.at(t)
         rows[:, 5] = self._light_on(rows)
         return rows
 
     def _light_on(self, rows: Floats) -> Floats:
         """Radiance of a white, upright surface at the passers-by's chests, averaged over all directions."""
-        chest = np.column_stack([rows[:, :2], 0.7 * rows[:, 4]])
-        total = np.zeros(len(rows))
-        for lamp in self.layout.lamps:
-            step = np.array(lamp.position) - chest
-            square = np.maximum(np.einsum("ij,ij->i", step, step), 0.25)
-            total += lamp.brightness * 0.5 * (0.25 + 0.75 * np.maximum(step[:, 2], 0.0) / np.sqrt(square)) / square
-        return np.asarray(self._light_floor + self._light_scale * total)
+        x, y, z = rows[:, 0], rows[:, 1], 0.7 * rows[:, 4]
+        at, brightness = self._lamps
+        up = at[2] - z
+        square = np.maximum((at[0] - x) ** 2 + (at[1] - y) ** 2 + up**2, 0.25)
+        light = brightness * 0.5 * (0.25 + 0.75 * np.maximum(up, 0.0) / np.sqrt(square)) / square
+        return np.asarray(self._light_floor + self._light_scale * light.sum(axis=0))
 
 
 def _rows(vectors: list[Vector3]) -> Floats:

@@ -17,6 +17,7 @@ Ints = NDArray[np.int64]
 Boxes = NDArray[np.int32]
 
 TILE = 16  # rows and columns of the boxes in which walkers are painted
+BLOCK = 4  # rows and columns of texels whose greatest coverage is known
 UNITY = 16384  # row gain of 1
 DN_STEPS = 64  # steps of a level per grey level
 SIGMA_STEPS = 32  # steps of a deviation per grey level
@@ -172,6 +173,12 @@ class _Board:
         across = 0.5 - across if self.drift < 0.0 else 0.5 + across
         return across * level[2] - 0.5, (1.0 - z / self.height) * level[1] - 0.5
 
+    def blocks(self, cover: Bytes, level: Ints) -> Bytes:
+        """Greatest coverage in the blocks of its picture."""
+        h, w = int(level[1]) // BLOCK, int(level[2]) // BLOCK
+        first = int(level[0]) // BLOCK**2 + (self.person * int(level[3]) + self.picture) * h * w
+        return cover[first : first + h * w].reshape(h, w)
+
     def look(self, sprites: Bytes, level: Ints, fx: Floats, fy: Floats) -> tuple[Floats, Floats]:
         """Coverage and radiance at places of its picture."""
         h, w = int(level[1]), int(level[2])
@@ -186,15 +193,24 @@ class _Board:
         return np.where(inside, value[..., 0] / 255.0, 0.0), value[..., 1] / 255.0 * self.light
 
 
+def reach(depth: Image) -> Image:
+    """Nearest and farthest depth in every tile, (rows, columns, 2)."""
+    rows, columns = (np.arange(0, size, TILE) for size in depth.shape)
+    return np.stack(
+        [ends.reduceat(ends.reduceat(depth, rows), columns, axis=1) for ends in (np.minimum, np.maximum)], axis=-1
+    )
+
+
 def paint_walkers(
     linear: Image,
     depth: Image,
+    reach: Image,
     rays: Image,
     T_store_camera: Floats,
     walkers: Floats,
     sprites: Bytes,
     levels: Ints,
-    spans: Floats,
+    cover: Bytes,
     row_time: float,
     boxes: Boxes,
 ) -> int:
@@ -206,7 +222,9 @@ def paint_walkers(
         Radiance, changed.
     depth, rays, T_store_camera
         As in `trace`.
-    walkers, sprites, levels, spans
+    reach : (rows, columns, 2) float32 array
+        See the function of that name.
+    walkers, sprites, levels, cover
         As in `robotd.sim.walker.Crowd`.
     row_time : float
         Seconds between two rows.
@@ -232,24 +250,22 @@ def paint_walkers(
         k = 0
         while k + 1 < len(levels) and pixel * board.distance * levels[k, 1] > 1.5 * board.height:
             k += 1
-        reach = d[..., :2] @ board.ahead
-        ahead = reach > 0.02
-        t = board.distance / np.where(ahead, reach, 1.0)
+        along = d[..., :2] @ board.ahead
+        ahead = along > 0.02
+        t = board.distance / np.where(ahead, along, 1.0)
         s = t * (d[..., :2] @ board.right) - board.drift * row_time * rows[:, None]
         z = origin[2] + t * d[..., 2]
         fx, fy = board.places(levels[k], s, z)
-        span = spans[board.person * levels[k, 3] + board.picture] * board.half
-        low, high = -span[::-1] if board.drift < 0.0 else span
+        blocks = board.blocks(cover, levels[k])
         for i, j in np.ndindex(len(rows) - 1, len(columns) - 1):
             part = slice(i, i + 2), slice(j, j + 2)
-            if (
-                not ahead[part].all()
-                or s[part].min() > high
-                or s[part].max() < low
-                or z[part].min() > board.height
-                or z[part].max() < 0.0
-                or used >= len(boxes)
-            ):
+            if not ahead[part].all() or used >= len(boxes) or t[part].min() >= reach[i, j, 1]:
+                continue
+            span = [
+                slice(max(int(place[part].min()), 0) // BLOCK, int(max(place[part].max(), -1.0)) // BLOCK + 1)
+                for place in (fy, fx)
+            ]
+            if not blocks[span[0], span[1]].any():
                 continue
             area = slice(rows[i], rows[i + 1]), slice(columns[j], columns[j + 1])
             inner = [_between(values[part], depth[area].shape) for values in (fx, fy, t)]
@@ -272,10 +288,55 @@ def _between(corners: Floats, shape: tuple[int, ...]) -> Floats:
     return np.asarray(edge[:, :1] + across * (edge[:, 1:] - edge[:, :1]))
 
 
-def transmission(
-    origins: Floats, targets: Floats, delays: Floats, walkers: Floats, sprites: Bytes, levels: Ints, out: Floats
+def on_share(t0: Floats, t1: Floats, frequency: Floats, duty: Floats) -> Floats:
+    """Share of [t0, t1] in which a light that blinks at `frequency` with this `duty` is on."""
+    turns0, turns1 = t0 * frequency, t1 * frequency
+    on = (np.floor(turns1) - np.floor(turns0)) * duty + np.minimum(turns1 % 1.0, duty) - np.minimum(turns0 % 1.0, duty)
+    return np.asarray(np.where(frequency > 0.0, on / np.maximum(turns1 - turns0, 1e-12), 1.0))
+
+
+def shine(
+    light: Floats,
+    pick: Ints,
+    blink: Floats,
+    ends: Floats,
+    peak: Floats,
+    t: float,
+    exposure: float,
+    row_time: float,
+    strength: Floats,
 ) -> None:
-    """Multiply `out` (N,) by the light that walkers let through from targets to origins (N, 3), `delays` s later."""
+    """Fill `strength` (2, N) with `peak` (N,) times the share of the exposure in which each light is on.
+
+    Parameters
+    ----------
+    light, pick : (M,) and (2, N) arrays
+        Shares, and which of them hold in the first and last row of each light's box; -1 for one that blinks by itself.
+    blink, ends : (N, 2) arrays
+        Frequency and duty of those; first and last row of the boxes.
+    t, exposure, row_time : float
+        Begin of row 0's exposure, its length, and seconds between two rows.
+    """
+    begin = t + row_time * ends.T
+    own = on_share(begin, begin + exposure, *blink.T)
+    picked = light[np.maximum(pick, 0)] if len(light) else own
+    strength[:] = np.where(pick >= 0, picked, own) * peak
+
+
+def transmission(
+    origins: Floats,
+    targets: Floats,
+    delays: Floats,
+    spots: Ints,
+    walkers: Floats,
+    sprites: Bytes,
+    levels: Ints,
+    strength: Floats,
+) -> None:
+    """Weaken `strength` (2, M) of lights by what walkers let through on the legs of their way to the camera.
+
+    Leg k leads from `targets` to `origins` (N, 3), `delays` s after row 0, and belongs to light `spots[k]`.
+    """
     for k in range(len(origins)):
         step = targets[k] - origins[k]
         for walker in walkers:
@@ -286,21 +347,26 @@ def transmission(
             t = board.distance / reach
             s = t * float(step[:2] @ board.right) - board.drift * delays[k]
             place = board.places(levels[0], np.array([s]), np.array([origins[k, 2] + t * step[2]]))
-            out[k] *= 1.0 - board.look(sprites, levels[0], *place)[0][0]
+            strength[:, spots[k]] *= 1.0 - board.look(sprites, levels[0], *place)[0][0]
 
 
 def add_lights(
-    linear: Image, boxes: Boxes, across: Image, down: Image, top: Floats, bottom: Floats, gain: NDArray[np.float32]
-) -> None:
+    linear: Image, boxes: Boxes, across: Image, down: Image, strength: Floats, gain: NDArray[np.float32], changed: Boxes
+) -> int:
     """Add point lights to `linear`: strength times down times across, divided by the rows' lamp gain.
 
-    `top` and `bottom` (N,) are the strengths in the first and last row of each box, straight in between, because the
-    rows are exposed one after the other; `across`, `down` (N, M) are the spread function's two factors.
+    `strength` (2, N) is that of the first and last row of each box, straight in between, because the rows are exposed
+    one after the other; `across`, `down` (N, M) are the spread function's two factors. Returns how many of the boxes
+    are not dark; they are written to `changed`.
     """
-    for k, (r0, r1, c0, c1) in enumerate(boxes):
-        strength = top[k] + (bottom[k] - top[k]) * np.arange(r1 - r0) / max(r1 - r0 - 1, 1)
-        row = strength * down[k, : r1 - r0] / gain[r0:r1]
+    bright = np.flatnonzero(strength.max(axis=0, initial=0.0) > 1e-5)
+    for k in bright:
+        r0, r1, c0, c1 = boxes[k]
+        along = strength[0, k] + (strength[1, k] - strength[0, k]) * np.arange(r1 - r0) / max(r1 - r0 - 1, 1)
+        row = along * down[k, : r1 - r0] / gain[r0:r1]
         linear[r0:r1, c0:c1] += (row[:, None] * across[k, : c1 - c0]).astype(np.float32)
+    changed[: len(bright)] = boxes[bright]
+    return len(bright)
 
 
 def _noise(bank: NDArray[np.int8], mask: int, seed: int, rows: Ints, columns: slice) -> NDArray[np.int32]:
@@ -347,8 +413,7 @@ def retouch(
     linear: Image,
     still: Image,
     boxes: Boxes,
-    level_of: NDArray[np.int16],
-    sigma_of: Bytes,
+    code_of: NDArray[np.int32],
     scale: float,
     gain: NDArray[np.float32],
     bank: NDArray[np.int8],
@@ -358,13 +423,13 @@ def retouch(
 ) -> None:
     """Expose the boxes of `linear` again, which walkers and lights changed, and set them back to `still`.
 
-    `level_of`, `sigma_of` are tables of level and deviation by radiance times `scale`; `gain` (H,) is linear here.
+    `code_of` is a table by radiance times `scale`, of levels times 256 plus deviations; `gain` (H,) is linear here.
     """
     for r0, r1, c0, c1 in boxes:
         value = linear[r0:r1, c0:c1] * (np.float32(scale) * gain[r0:r1, None]).astype(np.float32)
-        entry = np.minimum(value, len(level_of) - 1).astype(np.int32)
+        code = code_of[np.minimum(value, len(code_of) - 1).astype(np.int32)]
         noise = _noise(bank, mask, seed, np.arange(r0, r1), slice(int(c0), int(c1)))
-        levels = level_of[entry].astype(np.int32) + ((sigma_of[entry].astype(np.int32) * noise) >> 4)
+        levels = (code >> 8) + (((code & 255) * noise) >> 4)
         out[r0:r1, c0:c1] = np.clip((levels + 32) >> 6, 0, 255)
     for r0, r1, c0, c1 in boxes:
         linear[r0:r1, c0:c1] = still[r0:r1, c0:c1]

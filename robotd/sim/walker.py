@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Floats
+from .sensor import BLOCK
 from .stores import Walker
 
 PHASES = 12
@@ -35,37 +36,32 @@ class Crowd:
         Coverage and reflectance of all pictures, interleaved, level after level of their pyramids.
     levels : (3, 4) int64 array
         First texel, height, width, and pictures per person, of each level.
-    spans : (P, 2) array
-        What each picture covers, from left to right, where the whole of it is -1 to 1.
+    cover : (N / 32,) uint8 array
+        Greatest coverage in every `BLOCK` by `BLOCK` texels of all pictures and the texels that follow, in the same
+        order: where it is 0 there is nothing to blend.
     """
 
     walkers: tuple[Walker, ...]
     sprites: NDArray[np.uint8]
     levels: NDArray[np.int64]
-    spans: Floats
+    cover: NDArray[np.uint8]
 
-    def at(self, t: float, light: Floats) -> Floats:
-        """Where everybody is at time `t`.
-
-        Parameters
-        ----------
-        t : float
-            Seconds.
-        light : (K,) array
-            Radiance of a white person under the store's lamps.
+    def at(self, t: float) -> Floats:
+        """Where everybody is at time `t`, in seconds.
 
         Returns
         -------
         (K, 9) array
-            x, y in metres, velocity in m/s, height, light, phase of the step, person, half the picture's width.
+            x, y in metres, velocity in m/s, height, 0 (for their light), phase of the step, person, half the picture's
+            width.
         """
-        rows = np.empty((len(self.walkers), 9))
+        rows = []
         for k, walker in enumerate(self.walkers):
             x, y, vx, vy, travelled = along_path(walker, t)
             phase = int(travelled / (STRIDE * walker.height) * PHASES) % PHASES
             half = 0.5 * WIDTH * walker.height * walker.radius / 0.2
-            rows[k] = x, y, vx, vy, walker.height, light[k], phase, k, half
-        return rows
+            rows.append((x, y, vx, vy, walker.height, 0.0, phase, k, half))
+        return np.array(rows, dtype=np.float64)
 
 
 def along_path(walker: Walker, t: float) -> tuple[float, float, float, float, float]:
@@ -104,21 +100,27 @@ def make_crowd(walkers: tuple[Walker, ...], rng: np.random.Generator) -> Crowd:
                 pictures[k * count + phase * len(VIEWS) + view] = _person(
                     2.0 * math.pi * phase / PHASES, swing, clothes, pattern
                 )
-    buffers, levels, first = [], [], 0
+    buffers, covers, levels, first = [], [], [], 0
     for scale in (1, 2, 4):
         h, w = SPRITE[0] // scale, SPRITE[1] // scale
         shrunk = pictures.reshape(len(pictures), h, scale, w, scale, 2).mean(axis=(2, 4)).round().astype(np.uint8)
         buffers.append(shrunk.ravel())
+        covers.append(_cover(shrunk[..., 0]).ravel())
         levels.append((first, h, w, count))
         first += len(pictures) * h * w
-    sprites = np.concatenate([*buffers, np.zeros(2, np.uint8)])  # never empty, so that it has an address
-    covered = pictures[..., 0].max(axis=1) > 0
-    columns = SPRITE[1]
-    first_column, last_column = covered.argmax(axis=1), columns - covered[:, ::-1].argmax(axis=1)
-    spans = (
-        np.column_stack([first_column - 4, last_column + 4]) / (0.5 * columns) - 1.0
-    )  # a texel of the coarsest level
-    return Crowd(walkers, sprites, np.array(levels, np.int64), spans)
+    # never empty, so that they have an address
+    sprites, cover = (np.concatenate([*parts, np.zeros(2, np.uint8)]) for parts in (buffers, covers))
+    return Crowd(walkers, sprites, np.array(levels, np.int64), cover)
+
+
+def _cover(coverage: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Maximum (P, H / BLOCK, W / BLOCK) of every block and of the row and the column that follow it."""
+    pictures, h, w = coverage.shape
+    padded = np.pad(coverage, ((0, 0), (0, 1), (0, 1)))
+    for axis in (1, 2):
+        ahead = np.take(padded, np.arange(1, padded.shape[axis]), axis)
+        padded = np.maximum(np.take(padded, np.arange(padded.shape[axis] - 1), axis), ahead)
+    return np.asarray(padded.reshape(pictures, h // BLOCK, BLOCK, w // BLOCK, BLOCK).max(axis=(2, 4)))
 
 
 def _person(phase: float, swing: float, clothes: Floats, pattern: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from ..geometry.transforms import wrap_angle
 from ..records import (
@@ -22,6 +23,7 @@ from ..records import (
     Vector3,
 )
 from .bundle import SQUARE, Adjustment
+from .initial import world_rays
 from .linear import solve_linear
 from .problem import Bools, Problem, build_problem
 from .robust import OUTLIER, Optimum, optimise
@@ -29,6 +31,8 @@ from .robust import OUTLIER, Optimum, optimise
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
 _TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
 _TRUSTED_STOPS = 4  # agreement from as many is no chance, however many other sightings disagree
+_OUTSIDE_M = 0.5  # a position so far outside all others may be an image in a shop window or a glossy shelf
+_CLEARLY_NEARER_M = 0.2
 _UNKNOWN = np.diag([1e6, 1e6, np.pi**2])  # covariance of a stop that nothing ties to the world
 
 
@@ -67,7 +71,8 @@ def _to_map(asked: Problem, optimum: Optimum) -> Map:
     linear = everything.linearise(state, SQUARE)
     square = (linear.residual**2).sum(axis=1)
     counts = Counter(s.label for stop in problem.survey.stops for s in stop.sightings)
-    labels = tuple(_label(asked, optimum, i, counts[label]) for i, label in enumerate(problem.labels))
+    in_front = _in_front(optimum)
+    labels = tuple(_label(asked, optimum, i, counts[label], in_front[i]) for i, label in enumerate(problem.labels))
     located = {m.label for m in labels if m.status in ("placed", "known")}
     residual_px = linear.residual * problem.sightings.sigma[:, None]
     inlier = optimum.inlier
@@ -95,7 +100,7 @@ def _to_map(asked: Problem, optimum: Optimum) -> Map:
     )
 
 
-def _label(asked: Problem, optimum: Optimum, i: int, count: int) -> MappedLabel:
+def _label(asked: Problem, optimum: Optimum, i: int, count: int, in_front: Floats) -> MappedLabel:
     problem, label = optimum.problem, asked.labels[i]
     mine = problem.sightings.label == i
     all_stops = set(asked.sightings.stop[asked.sightings.label == i].tolist())
@@ -125,7 +130,7 @@ def _label(asked: Problem, optimum: Optimum, i: int, count: int) -> MappedLabel:
         return unplaced("seen only from stops that could not be joined to the map; map it together with mapped labels")
     lead = optimum.gain[i] - optimum.rival_gain[i]
     if np.isfinite(optimum.rival_points[i, 0]) and lead < _TIE and optimum.rival_gain[i] > _TIE * optimum.gain[i]:
-        return _ambiguous(optimum, i, label, count, inliers)
+        return _ambiguous(optimum, i, label, count, inliers, optimum.rival_points[i])
     if covariance is None:
         return unplaced(
             f"its {count} sightings do not meet in one point (reflections or wrong identities); flash it again, alone"
@@ -137,14 +142,60 @@ def _label(asked: Problem, optimum: Optimum, i: int, count: int) -> MappedLabel:
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     if not sigma <= WIDEST_SIGMA_M:
         return unplaced(f"views nearly parallel (standard deviation {sigma:.2g} m); map it from a stop further aside")
+    if np.isfinite(in_front).all():
+        reason = "perhaps an image in glass: one sighting puts the label nearer; map it from another stop"
+        return _ambiguous(optimum, i, label, count, inliers, in_front, reason)
     return MappedLabel(label, "placed", position, _matrix(covariance), count, inliers)
 
 
-def _ambiguous(optimum: Optimum, i: int, label: str, count: int, inliers: int) -> MappedLabel:
+def _in_front(optimum: Optimum) -> Floats:
+    """(L, 3) where a label may be whose position is perhaps only its image in upright glass; NaN for all others.
+
+    An image lies behind the pane, mostly outside everything else that was mapped. If then a sighting that does not fit
+    meets the image's height nearer, and from every stop so, it may be the label itself, seen only once.
+    """
+    problem, state = optimum.problem, optimum.state
+    result = np.full((len(problem.labels), 3), np.nan)
+    odd = np.flatnonzero(~optimum.inlier & ~optimum.reflected)
+    sightings = problem.sightings.select(odd)
+    if len(odd) == 0:
+        return result
+    origin, direction = world_rays(problem, sightings, state)
+    points = state.points[sightings.label]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = (points[:, 2] - origin[:, 2]) / direction[:, 2]
+        there = origin + reach[:, None] * direction
+    gap = np.linalg.norm(points - origin, axis=1) - np.linalg.norm(there - origin, axis=1)
+    for k in np.flatnonzero((reach > _CLEARLY_NEARER_M) & (gap > _CLEARLY_NEARER_M)):
+        mine = problem.sightings.stop[problem.sightings.label == sightings.label[k]]
+        at = problem.stop_entries(state)[mine, :2]
+        nearer = np.linalg.norm(there[k, :2] - at, axis=1) < np.linalg.norm(points[k, :2] - at, axis=1)
+        if nearer.all():
+            result[sightings.label[k]] = there[k]
+    trusted = optimum.adjustment.labels[~np.isfinite(result[optimum.adjustment.labels, 0])]
+    around = np.vstack([state.points[trusted, :2], problem.stop_entries(state)[optimum.placed, :2]])
+    for i in np.flatnonzero(np.isfinite(result[:, 0])):
+        if _outside(around, state.points[i, :2]) < _OUTSIDE_M:
+            result[i] = np.nan
+    return result
+
+
+def _outside(around: Floats, point: Floats) -> float:
+    """Metres by which a point lies outside the convex hull of others (N, 2); 0 if there is no hull."""
+    try:
+        hull = ConvexHull(around)
+    except (QhullError, ValueError):  # fewer than three, or all on one line
+        return 0.0
+    return float(np.max(hull.equations[:, :2] @ point + hull.equations[:, 2]))
+
+
+def _ambiguous(
+    optimum: Optimum, i: int, label: str, count: int, inliers: int, other: Floats, reason: str | None = None
+) -> MappedLabel:
     problem, state = optimum.problem, optimum.state
     mine = Adjustment(problem, problem.sightings.select(problem.sightings.label == i))
     candidates = []
-    for point in (state.points[i], optimum.rival_points[i]):
+    for point in (state.points[i], other):
         points = state.points.copy()
         points[i] = point
         linear = mine.linearise(replace(state, points=points), SQUARE)
@@ -153,7 +204,7 @@ def _ambiguous(optimum: Optimum, i: int, label: str, count: int, inliers: int) -
         candidates.append(Candidate(_vector(point), float(cost)))
     candidates.sort(key=lambda c: c.cost)
     distance = float(np.linalg.norm(np.subtract(candidates[0].position, candidates[1].position)))
-    reason = (
+    reason = reason or (
         f"two positions {distance:.1f} m apart explain its sightings equally well (mirror solutions tied); "
         "map it from another stop"
     )

@@ -29,7 +29,7 @@ _SAME = 0.5  # difference of two starts' costs below which they found the same m
 _FLOOR_IMAGE_PX = 6.0
 _UPRIGHT_M = 0.03  # a label and its image in upright glass are equally high; what tilt and calibration leave
 _IMAGES = 4  # images of one label in different panes that are looked for
-_CHANCE = 0.45  # share of an image's support with which the label itself stands out from chance
+_CHANCE = 0.25  # share of an image's support with which the label itself stands out from chance
 _MEDIAN = 2.0 * np.log(2.0)  # of the squared length of a standard normal vector in the plane
 
 
