@@ -29,7 +29,7 @@ bench: $(READY)
 	$(BIN)/python -m tests.bench
 
 campaign: $(DEV)
-	HYPOTHESIS_PROFILE=campaign $(BIN)/python -m pytest tests/campaign tests
+	HYPOTHESIS_PROFILE=campaign $(BIN)/python -m pytest tests tests/campaign/surveys.py
 
 setup: $(DEV)
 

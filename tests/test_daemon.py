@@ -1,7 +1,13 @@
 import asyncio
 import dataclasses
+import os
 import re
+import signal
+import socket
+import subprocess
+import sys
 import tomllib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -84,6 +90,7 @@ def fakes(monkeypatch):
     monkeypatch.setattr(daemon_module, "load", lambda name, where: {kind: fake(kind) for kind in kinds}[name])
 
 
+FLOOR_MOUNT = Transform((-1.6433, 1.6433, -0.8554), (0.12, 0.0, 0.30))  # looks forward and down
 CAMERA = CameraModel("front", (640, 480), (268.5, 268.5, 319.5, 239.5), Transform((0, 0, 0), (0, 0, 0.5)))
 
 
@@ -272,3 +279,31 @@ def test_labels_that_no_stop_saw_are_in_the_map_with_their_reason():
     ended = complete_map(solved, ["a", "b"], 1, "line lost")
     assert "line lost" in ended.labels[1].reason
     assert "line lost" in ended.notes[-1]
+
+
+# ---- as a service ----------------------------------------------------------------------------------------------------
+
+
+def test_without_any_device_the_daemon_reports_retries_and_ends_cleanly(tmp_path):
+    text = EXAMPLE.read_text().replace("labels.example", "127.0.0.1").replace("port = 7071", "port = 9")
+    camera = CameraModel("floor", (320, 240), (228.5, 228.5, 159.5, 119.5), FLOOR_MOUNT)
+    rig = [replace(CAMERA, name=name) for name in ("front", "left", "rear", "right")]
+    text = text.replace("[robot]\n", '[robot]\nstate_directory = "state"\ncalibration = "calibration.toml"\n')
+    (tmp_path / "robotd.toml").write_text(text)
+    save_calibration(Calibration(cameras=tuple(rig), floor_camera=camera), tmp_path / "calibration.toml")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(60.0)
+        environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
+        command = [sys.executable, "-m", "robotd", "run", "-c", str(tmp_path / "robotd.toml")]
+        with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+            assert manager.recv(1000) == b"READY=1\nSTATUS=ready"
+            while manager.recv(1000) != b"WATCHDOG=1":
+                pass
+            missing = {"base", "front", "left", "rear", "right", "floor", "labels"}
+            while missing:  # every device is reported, one after the other
+                missing.discard(process.stderr.readline().removeprefix("ERROR ").split(":")[0])
+            process.send_signal(signal.SIGTERM)
+            _, shown = process.communicate(timeout=30)
+    assert process.returncode == 0, shown
+    assert (tmp_path / "state" / "journal.sqlite").exists()
