@@ -42,13 +42,19 @@ def parser() -> argparse.ArgumentParser:
 
     demo = commands.add_parser("demo", help="a whole survey in the simulator, from bytes and pixels to the map")
     demo.add_argument("--store", default="room", help="room, warehouse or a robotd-store/1 file (default: room)")
-    demo.add_argument("--seed", type=int, default=1, help="seed of the world's noise (default: 1)")
+    demo.add_argument("--seed", type=_seed, default=1, help="seed of the world's noise (default: 1)")
     demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results (default: out/demo)")
     demo.add_argument("--world", type=Path, help="a TOML file whose [world] table changes the world's noise")
     demo.add_argument("--json", action="store_true", help="print the result as one JSON object")
     demo.add_argument("--realtime", action="store_true", help="run at wall speed instead of as fast as possible")
     demo.add_argument("--record", action="store_true", help="keep every frame and every serial byte (MCAP; large)")
     return top
+
+
+def _seed(text: str) -> int:
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number of 0 or more")
+    return int(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

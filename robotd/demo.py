@@ -30,7 +30,7 @@ from .bus import Bus
 from .clock import run_virtual, ticks
 from .config import save_calibration
 from .daemon import Daemon, assemble
-from .errors import RobotdError
+from .errors import InputError, RobotdError
 from .files import save_map, save_map_csv, save_survey, survey_from_json
 from .records import Map, Survey
 from .sim.hardware import SimHardware
@@ -55,6 +55,7 @@ calibration = "calibration.toml"
 survey = {survey}
 stops = {stops}
 labels = {labels}
+known_labels = [{known}]
 
 [upload]
 url = {url}
@@ -105,31 +106,16 @@ def demo(arguments: argparse.Namespace) -> int:
     layout = load_store(find_store(arguments.store))
     settings = load_settings(arguments.world) if arguments.world is not None else WorldSettings()
     out: Path = arguments.out
-    for folder in ("robot", "server", "labels"):
-        shutil.rmtree(out / folder, ignore_errors=True)
-        (out / folder).mkdir(parents=True)
-    world = World(layout, settings, arguments.seed, out / "labels")
+    run = _fresh_folder(out / ".robotd")
+    world = World(layout, settings, arguments.seed, run / "labels")
     with ExitStack() as stack:
-        token = _write_token(out / "robot")
-        gateway = stack.enter_context(
-            _service(
-                "robotd.gateway", "--folder", out / "labels", "--port", "0", "--token-file", out / "robot" / "token"
-            )
-        )
-        server = stack.enter_context(
-            _service(
-                "robotd.solver_main",
-                "serve",
-                "--port",
-                "0",
-                "--data",
-                out / "server",
-                "--token-file",
-                out / "robot" / "token",
-            )
-        )
-        save_calibration(world.believed_calibration(), out / "robot" / "calibration.toml")
-        path = _write_config(out / "robot", layout, url=server, gateway_port=int(gateway.rsplit(":", 1)[1]))
+        token_file = run / "robot" / "token"
+        token = _write_token(token_file)
+        shared = ("--port", "0", "--token-file", token_file)
+        gateway = stack.enter_context(_service("robotd.gateway", "--folder", run / "labels", *shared))
+        server = stack.enter_context(_service("robotd.solver_main", "serve", "--data", run / "server", *shared))
+        save_calibration(world.believed_calibration(), run / "robot" / "calibration.toml")
+        path = _write_config(run / "robot", world, url=server, gateway_port=int(gateway.rsplit(":", 1)[1]))
         recorder = None
         if arguments.record:
             from .recording import FrameRecorder
@@ -140,6 +126,17 @@ def demo(arguments: argparse.Namespace) -> int:
         mission_s = _run(daemon, world, trail, realtime=arguments.realtime, progress=sys.stderr)
         survey = _download_survey(server, layout.name, token)
     return _report(arguments, layout, world, daemon, survey, trail=trail, mission_s=mission_s, started=started)
+
+
+def _fresh_folder(run: Path) -> Path:
+    """What the three programs keep on disk, in a hidden folder that nobody else uses; that of the last run goes."""
+    try:
+        shutil.rmtree(run, ignore_errors=True)
+        for folder in ("robot", "server", "labels"):
+            (run / folder).mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"--out {run.parent}: cannot be written: {error.strerror}; name another folder") from error
+    return run
 
 
 def _run(daemon: Daemon, world: World, trail: Trail, *, realtime: bool, progress: TextIO) -> float:
@@ -204,20 +201,25 @@ async def _show_progress(bus: Bus, out: TextIO) -> None:
             out.write("\r\033[K")
 
 
-def _write_token(folder: Path) -> str:
+def _write_token(path: Path) -> str:
     token = secrets.token_hex(16)
-    path = folder / "token"
     path.touch(mode=0o600)
     path.write_text(token + "\n")
     return token
 
 
-def _write_config(folder: Path, layout: StoreLayout, *, url: str, gateway_port: int) -> Path:
-    """The configuration that an owner would write for this store: no positions, only ids, stops and the tape."""
+def _write_config(folder: Path, world: World, *, url: str, gateway_port: int) -> Path:
+    """The configuration that an owner would write for this store: ids, stops, the tape, what was measured by hand."""
+    layout = world.layout
+    known = [
+        f"{{ label = {json.dumps(label.label)}, position = {list(label.position)}, sigma_m = {label.sigma_m} }}"
+        for label in world.measured_labels()
+    ]
     text = CONFIG.format(
         survey=json.dumps(layout.name),
         stops=json.dumps(list(layout.line.stops)),
         labels=json.dumps([label.id for label in layout.labels]),
+        known=", ".join(known),
         url=json.dumps(url),
         width=layout.line.width,
         color=json.dumps(layout.line.color),

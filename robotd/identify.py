@@ -188,11 +188,15 @@ class _Camera:
         self.detector = FlashDetector(flash)
         self.bursts = BurstScorer(flash.pattern, flash.exposure_s)
         self.patches = PatchRecorder(flash.pattern, flash.exposure_s, flash.gamma)
+        self.latest = -np.inf
         self.scored = -np.inf
         self.activity = (-np.inf, np.zeros(0), np.zeros(0))  # scored until; first and last burst of each light
 
     def update(self, frame: Frame) -> None:
         with self.lock:
+            if frame.t <= self.latest:  # a camera that repeats or reorders its frames tells nothing new with them
+                return
+            self.latest = frame.t
             decided = self.detector.update(frame.image, frame.t)
             self.patches.record(frame.image, frame.t)
             tracks = self.detector.tracks

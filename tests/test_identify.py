@@ -160,6 +160,15 @@ def test_beginning_another_slot_than_the_planned_one_is_refused():
         identifier.begin(slot, 1.0)
 
 
+def test_repeated_and_reordered_frames_are_passed_over():
+    identifier = Identifier(["a"], ["front"], CONFIG)
+    slot = identifier.next_slot()
+    identifier.begin(slot, 0.0)
+    for t in (0.1, 0.2, 0.2, 0.15, 0.3):
+        identifier.update("front", Frame("front", t, np.zeros((120, 160), np.uint8)))
+    assert identifier.finish() == ()
+
+
 def test_without_labels_or_cameras_nothing_is_asked_or_found():
     assert Identifier([], ["front"], CONFIG).next_slot() is None
     assert Identifier([], ["front"], CONFIG).finish() == ()

@@ -19,7 +19,7 @@ from robotd.records import CameraModel, Floats, Frame, Pose
 from robotd.sim.body import Body
 from robotd.sim.floor import FloorRenderer
 from robotd.sim.hardware import CAMERAS, PORT, START, SimHardware
-from robotd.sim.stores import LabelLayout, LineLayout, Shelf, StoreLayout, Wall
+from robotd.sim.stores import LabelLayout, LineLayout, MeasuredLabel, Shelf, StoreLayout, Wall
 from robotd.sim.world import World, WorldSettings, load_settings
 
 TICK = 0.015
@@ -462,3 +462,18 @@ def test_pins_are_simulated(world: World) -> None:
         led.on()
         assert hardware.pins.pin(17).state
     hardware.pins.close()
+
+
+def test_measured_labels_are_in_world_axes_with_the_stated_error(tmp_path: Path) -> None:
+    labels = tuple(LabelLayout(f"L{n}", (0.1 * n, 0.5, 1.0), (0.0, 1.0, 0.0)) for n in range(10))
+    known = tuple(MeasuredLabel(label.id, 0.010) for label in labels)
+    layout = dataclasses.replace(STORE, labels=labels, known_labels=known)
+    errors = []
+    for seed in range(8):
+        world = World(layout, SETTINGS, seed, tmp_path)
+        truth = world.to_world(np.array([label.position for label in labels]))
+        errors += [np.subtract(m.position, t) for m, t in zip(world.measured_labels(), truth, strict=True)]
+        assert np.linalg.norm(truth[9] - truth[0]) == pytest.approx(0.9)
+    origin = world.to_world(np.array([[world.body.start.x, world.body.start.y, 0.0]]))
+    np.testing.assert_allclose(origin, 0.0, atol=1e-12)
+    assert np.std(errors) == pytest.approx(0.010, rel=0.15)

@@ -26,7 +26,9 @@ class Referee:
 
     def truth(self) -> dict[str, Vector3]:
         """True label positions in the world frame: the robot's true x, y, heading at stop 1, z from the floor."""
-        return {label.id: self._to_world(np.array([label.position]))[0] for label in self._world.layout.labels}
+        labels = self._world.layout.labels
+        positions = self._world.to_world(np.array([label.position for label in labels]).reshape(-1, 3))
+        return {label.id: (float(x), float(y), float(z)) for label, (x, y, z) in zip(labels, positions, strict=True)}
 
     def write_truth(self, path: Path) -> dict[str, Vector3]:
         """Write truth.csv; returns what it holds."""
@@ -56,11 +58,6 @@ class Referee:
         rms = float(np.sqrt(np.mean(distance**2))) if len(distance) else 0.0
         return {"rms": round(1e3 * rms, 2), "max": round(1e3 * float(distance.max(initial=0.0)), 2)}
 
-    def path(self) -> Floats:
-        """(N, 2) true path in world metres."""
-        trail = self._world.body.trail()
-        return np.array([at[:2] for at in self._to_world(np.column_stack([trail[:, :2], np.zeros(len(trail))]))])
-
     def outline(self) -> list[Floats]:
         """Walls and shelves as (N, 2) polylines in world metres."""
         layout = self._world.layout
@@ -76,14 +73,7 @@ class Referee:
         return list(zip(self.outline(), heights, strict=True))
 
     def _flat(self, points: Floats) -> Floats:
-        return np.array([at[:2] for at in self._to_world(np.column_stack([points, np.zeros(len(points))]))])
-
-    def _to_world(self, points: Floats) -> list[Vector3]:
-        origin = self._world.body.start
-        c, s = np.cos(origin.heading), np.sin(origin.heading)
-        dx, dy = points[:, 0] - origin.x, points[:, 1] - origin.y
-        world = np.column_stack([c * dx + s * dy, c * dy - s * dx, points[:, 2]])
-        return [(float(x), float(y), float(z)) for x, y, z in world]
+        return self._world.to_world(np.column_stack([points, np.zeros(len(points))]))[:, :2]
 
 
 def _even(points: Floats, step: float) -> Floats:

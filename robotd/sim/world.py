@@ -13,7 +13,7 @@ import numpy as np
 from ..config import Calibration
 from ..geometry.transforms import rotation_matrix, rotation_vector
 from ..odometry import Wheels
-from ..records import CameraModel, Floats, Pose, Priors, Transform, Vector3
+from ..records import CameraModel, Floats, KnownLabel, Pose, Priors, Transform, Vector3
 from .body import Body
 from .labels import LabelSystem
 from .layout import StoreLayout
@@ -123,6 +123,26 @@ class World:
                 odometry_scale=s.wheel_scale_error,
                 odometry_turn=math.hypot(s.wheel_scale_error, s.wheel_base_error),
             ),
+        )
+
+    def to_world(self, points: Floats) -> Floats:
+        """(N, 3) points from store to world axes: the robot's true x, y, heading at its start, z from the floor."""
+        start = self.body.start
+        c, s = math.cos(start.heading), math.sin(start.heading)
+        dx, dy = points[:, 0] - start.x, points[:, 1] - start.y
+        return np.column_stack([c * dx + s * dy, c * dy - s * dx, points[:, 2]])
+
+    def measured_labels(self) -> tuple[KnownLabel, ...]:
+        """The layout's known labels as the operator measured them: in world axes, with the stated error."""
+        where = {label.id: label.position for label in self.layout.labels}
+        rng = self.rng("measured")
+        return tuple(
+            KnownLabel(
+                known.id,
+                _vector3(self.to_world(np.array([where[known.id]]))[0] + known.sigma * rng.standard_normal(3)),
+                max(known.sigma, 1e-4),  # a survey knows nothing exactly
+            )
+            for known in self.layout.known_labels
         )
 
     def unplug(self, device: str) -> None:
