@@ -90,6 +90,11 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         return self._virtual.time
 
+    async def shutdown_default_executor(self, *args: Any, **kwargs: Any) -> None:
+        """As on any loop, with time held: its time-out is about threads, which live in real time."""
+        with self.held():
+            await super().shutdown_default_executor(*args, **kwargs)
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Time stands still inside; holds nest and overlap."""

@@ -52,8 +52,8 @@ class IdentifyConfig:
     lost_fraction: float = ranged(0.02, minimum=1e-4, maximum=0.5, doc="fraction of commands that are lost")
     durations_s: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
     check_digits: int = ranged(1, minimum=0, maximum=6, doc="digits of a code word beyond those that tell labels apart")
-    max_repeats: int = ranged(1, minimum=0, maximum=3, doc="further slots for what is still undecided")
-    repeat_fraction: float = ranged(0.15, minimum=0.0, maximum=1.0, doc="undecided fraction that is worth such a slot")
+    max_repeats: int = ranged(2, minimum=0, maximum=3, doc="further slots for what is still undecided")
+    repeat_fraction: float = ranged(0.05, minimum=0.0, maximum=1.0, doc="undecided fraction that is worth such a slot")
     min_probability: float = ranged(0.99, minimum=0.5, maximum=1.0, doc="below it a light is undecided")
     surprise: float = ranged(0.003, minimum=1e-6, maximum=0.2, doc="fraction of flashes with another length than asked")
     none_fraction: float = ranged(

@@ -1,4 +1,5 @@
 import asyncio
+import threading
 import time
 
 import pytest
@@ -77,3 +78,14 @@ def test_a_late_consumer_gets_every_tick():
                 return got
 
     assert run_virtual(main()) == [(0, 0.0), (1, 0.1), (2, 0.45), (3, 0.45), (4, 0.45), (5, 0.5)]
+
+
+def test_the_end_waits_for_threads_in_real_time():
+    release = threading.Event()
+
+    async def main():
+        asyncio.get_running_loop().run_in_executor(None, release.wait, 60.0)
+        threading.Timer(0.2, release.set).start()
+
+    run_virtual(main())  # a time-out that virtual time ran into would be a warning, and warnings are errors
+    assert release.is_set()
