@@ -27,7 +27,7 @@ from typing import TextIO
 from urllib.parse import quote
 
 from .bus import Bus
-from .clock import run_virtual, ticks
+from .clock import now, run_virtual, ticks
 from .config import save_calibration
 from .daemon import Daemon, assemble
 from .errors import InputError, RobotdError
@@ -180,17 +180,14 @@ async def _show_progress(bus: Bus, out: TextIO) -> None:
                 out.flush()
 
     async def status() -> None:
-        with bus.status.subscribe() as subscription:
-            async for item in subscription:
-                if live:
-                    filled = 30 * max(0, item.stop - 1) // max(1, item.stops)
-                    bar = "#" * filled + "." * (30 - filled)
-                    wall = time.monotonic() - begun
-                    out.write(
-                        f"\r[{bar}] stop {item.stop}/{item.stops}  {item.state} {item.text}  "
-                        f"mission {item.t:.0f} s, wall {wall:.0f} s\033[K"
-                    )
-                    out.flush()
+        async for _ in ticks(0.5):
+            item = bus.status.latest
+            if live and item is not None:
+                filled = 30 * max(0, item.stop - 1) // max(1, item.stops)
+                bar = "#" * filled + "." * (30 - filled)
+                spent = f"mission {now():.0f} s, wall {time.monotonic() - begun:.0f} s"
+                out.write(f"\r[{bar}] stop {item.stop}/{item.stops}  {item.state} {item.text}  {spent}\033[K")
+                out.flush()
 
     try:
         async with asyncio.TaskGroup() as group:
