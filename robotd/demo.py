@@ -12,6 +12,7 @@ import argparse
 import asyncio
 import json
 import logging
+import re
 import resource
 import secrets
 import shutil
@@ -247,6 +248,16 @@ def _service(module: str, *arguments: object) -> Iterator[str]:
                 process.kill()
 
 
+def _peak_mb() -> float:
+    """The largest resident memory that this process or one of its children ever had, in MiB.
+
+    Our own comes from /proc, because getrusage also counts what our parent had when it started us.
+    """
+    own = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    return max(int(own[1]) if own else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, children) / 1024
+
+
 def _download_survey(server: str, name: str, token: str) -> Survey | None:
     request = urllib.request.Request(
         f"{server}/api/surveys/{quote(name, safe='')}", headers={"Authorization": f"Bearer {token}"}
@@ -287,7 +298,7 @@ def _report(
     map_png(out / "map.png", solved, survey=survey, truth=truth, outline=outline, trail=trail)
     map_html(out / "map.html", solved, survey=survey, truth=truth, outline3d=referee.outline3d())
     wall_s = time.monotonic() - started
-    peak_kb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    peak_mb = _peak_mb()
     result = {
         "store": layout.name,
         "seed": arguments.seed,
@@ -300,7 +311,7 @@ def _report(
         "stops": len(survey.stops),
         "mission_s": round(mission_s, 1),
         "wall_s": round(wall_s, 1),
-        "peak_mb": round(peak_kb / 1024, 1),
+        "peak_mb": round(peak_mb, 1),
         "world": asdict(world.settings),
     }
     if arguments.json:
@@ -308,7 +319,7 @@ def _report(
         return 0
     print(text_table({"bundle adjustment": bundle_score, "linear triangulation": linear_score}))
     print(f"line: {cross_track['rms']:.1f} mm rms, {cross_track['max']:.1f} mm at most off the tape's centre")
-    spent = f"wall {wall_s:.0f} s; peak memory {peak_kb / 1024:.0f} MB"
+    spent = f"wall {wall_s:.0f} s; peak memory {peak_mb:.0f} MB"
     print(f"mission {mission_s / 60:.1f} min (virtual), {len(survey.stops)} stops; {spent}")
     for label in solved.labels:
         if label.status not in ("placed", "known"):
