@@ -329,9 +329,9 @@ class Daemon:
         await mission.run()
         if uploader is not None:
             await self._fetch_map(mission, uploader, state)
-        assembly.bus.status.publish(
-            replace(assembly.bus.status.latest, t=now(), state="done") if assembly.bus.status.latest else None  # type: ignore[arg-type]
-        )
+        status = assembly.bus.status.latest
+        if status is not None:
+            assembly.bus.status.publish(replace(status, t=now(), state="done"))
 
     async def _fetch_map(self, mission: Mission, uploader: Uploader, state: Path) -> None:
         config = self.assembly.config

@@ -66,7 +66,7 @@ class PathFollower:
         self._tick = 0
 
     def steer(self, path: Floats, pose: Pose, remaining: float, *, lost: float, dt: float) -> Steering:
-        """Speed and turn rate for now.
+        """Speed (m/s) and turn rate (rad/s) to drive with until the next call.
 
         Parameters
         ----------

@@ -193,7 +193,7 @@ class Mission:
         started = now()
         identifier.begin(slot, started)
         for request in slot.requests:
-            await self.labels.flash(request.labels, 1.0, request.duration)
+            await self.labels.flash(request.labels, self.config.identify.strength, request.duration)
         self._status("observing", len(self.stops) + 1, f"slot {slot.number + 1}")
         while now() < started + slot.timeout and not identifier.is_complete(now()):
             await asyncio.sleep(0.1)

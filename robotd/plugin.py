@@ -100,7 +100,8 @@ class Labels(Protocol):
     async def flash(self, labels: Sequence[str], strength: float, duration: float) -> None:
         """Ask that these labels flash for `duration` seconds (whole seconds) at `strength` 0..1.
 
-        Returns when the request was accepted for delivery; raises DriverFault if it was not.
+        Returns when the request was accepted for delivery. Raises DriverFault if the label system cannot be reached,
+        and MissionError if it refuses the request: asking again would not help.
         """
 
 

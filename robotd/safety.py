@@ -95,7 +95,7 @@ class SafetyGate:
             self._latch(self._frame)
 
     def output(self, t: float) -> Motion:
-        """The motion for now; to be asked at least every `loop_s` seconds, `t` in loop time."""
+        """The motion that is safe at `t`; to be asked at least every `loop_s` seconds, in loop time."""
         elapsed = 0.0 if self._last_t is None else max(0.0, t - self._last_t)
         self._last_t = t
         cause = self._cause(t, elapsed)

@@ -1,4 +1,7 @@
-"""How hard property tests try: the same examples every time by default, many fresh ones in the campaign."""
+"""How hard property tests try: the same examples every time by default, fresh ones in the campaign.
+
+A test that sets its own number of examples keeps it.
+"""
 
 import os
 
