@@ -91,7 +91,7 @@ def _one_thread_each() -> None:
 
 def check(path: Path) -> int:
     """Name every mistake of a configuration, a calibration or a layout; raises InputError with them."""
-    from .config import load_calibration, load_config, read_toml
+    from .config import load_calibration, read_toml
 
     data = read_toml(path)
     if "format" in data:
@@ -104,15 +104,13 @@ def check(path: Path) -> int:
         load_calibration(path)
         print(f"{path}: a calibration without mistakes")
         return 0
-    from .daemon import assemble, plan_drivers
+    from .daemon import assemble, read_config
     from .real import RealHardware
 
-    config = load_config(path)
+    config, _ = read_config(path)
     calibration = path.parent / config.robot.calibration
     if calibration.exists():
         assemble(path, RealHardware())
-    else:
-        plan_drivers(path, config)
     print(f"{path}: no mistakes")
     if not calibration.exists():
         print(f"{path}: note: {calibration} does not exist yet; a mission needs the robot's calibration")

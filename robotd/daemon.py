@@ -17,7 +17,7 @@ from typing import Any, cast
 from .bind import bind
 from .bus import Bus
 from .clock import in_thread, now, ticks
-from .config import Calibration, Config, collect, load_calibration, load_config
+from .config import Calibration, Config, collect, load_calibration, load_config, read_toml
 from .errors import ConfigError, DriverFault, UploadError
 from .files import map_to_json
 from .hardware import Hardware
@@ -68,7 +68,18 @@ class Plan:
     config: Any
 
 
-def plan_drivers(path: Path, config: Config) -> dict[str, Plan]:
+def read_config(path: Path) -> tuple[Config, dict[str, Plan]]:
+    """Read robotd.toml and bind its drivers' sections; raises ConfigError listing the mistakes of both."""
+    problems: list[str] = []
+    config = collect(problems, lambda: load_config(path))
+    sections = read_toml(path).get("drivers") if config is None else config.drivers
+    plans = collect(problems, lambda: plan_drivers(path, sections if isinstance(sections, dict) else {}))
+    if config is None or plans is None:
+        raise ConfigError(*problems)
+    return config, plans
+
+
+def plan_drivers(path: Path, sections: Mapping[str, Any]) -> dict[str, Plan]:
     """Bind every driver's section; relative paths in it are relative to the configuration's folder.
 
     Raises
@@ -78,7 +89,9 @@ def plan_drivers(path: Path, config: Config) -> dict[str, Plan]:
     """
     problems: list[str] = []
     plans: dict[str, Plan] = {}
-    for name, section in config.drivers.items():
+    for name, section in sections.items():
+        if not (isinstance(section, dict) and isinstance(section.get("driver"), str)):
+            continue  # reported with the configuration
         where = f"{path} [drivers.{name}]"
         plan = collect(problems, lambda name=name, section=section, where=where: _plan(path, name, section, where))  # type: ignore[misc]
         if plan is not None:
@@ -128,17 +141,22 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
     ConfigError
         Lists every mistake of the configuration, of its drivers' sections and of the calibration.
     """
-    config = load_config(path)
     problems: list[str] = []
-    plans = collect(problems, lambda: plan_drivers(path, config)) or {}
-    calibration = collect(problems, lambda: load_calibration(path.parent / config.robot.calibration)) or Calibration()
-    if not problems:
-        cameras = _of_kind(plans, "camera")
-        problems += [
-            f"{path}: the calibration knows the camera '{camera.name}', but there is no camera [drivers.{camera.name}]"
-            for camera in calibration.cameras
-            if camera.name not in cameras
-        ]
+    read = collect(problems, lambda: read_config(path))
+    config = read[0] if read else collect([], lambda: load_config(path))
+    plans = read[1] if read else {}
+    calibration = Calibration()
+    if config is not None:
+        where = path.parent / config.robot.calibration
+        calibration = collect(problems, lambda: load_calibration(where)) or calibration
+    if problems or config is None:
+        raise ConfigError(*problems)
+    cameras = _of_kind(plans, "camera")
+    problems += [
+        f"{path}: the calibration knows the camera '{camera.name}', but there is no camera [drivers.{camera.name}]"
+        for camera in calibration.cameras
+        if camera.name not in cameras
+    ]
     bus = Bus()
     drivers: dict[str, Driver] = {}
     for name, plan in plans.items() if not problems else ():

@@ -18,7 +18,7 @@ from robotd.bind import bind
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
 from robotd.config import Calibration, Config, save_calibration
-from robotd.daemon import ControlLoop, Supervisor, assemble
+from robotd.daemon import ControlLoop, Supervisor, assemble, read_config
 from robotd.errors import ConfigError, DriverFault
 from robotd.mission import complete_map
 from robotd.odometry import Odometry, Wheels
@@ -146,6 +146,15 @@ def test_mistakes_of_drivers_and_calibration_are_reported_together(tmp_path, fak
     with pytest.raises(ConfigError) as caught:
         assemble(path, hardware=None)
     assert len(caught.value.problems) == 2
+
+
+def test_mistakes_of_the_configuration_and_of_its_drivers_are_reported_together(tmp_path):
+    text = '[safty]\n[mission]\nstops = [1.0, 0.0]\n[drivers.wheels]\ndriver = "rumba"'
+    with pytest.raises(ConfigError) as caught:
+        read_config(write_config(tmp_path, text))
+    found = "\n".join(caught.value.problems)
+    assert len(caught.value.problems) == 3
+    assert all(word in found for word in ("'safty'", "increasing distances", "unknown driver 'rumba'"))
 
 
 def test_an_unknown_driver_names_the_installed_ones(tmp_path):
