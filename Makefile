@@ -1,4 +1,4 @@
-# make demo | test | check | bench | campaign: each does its own set-up, into ./.venv
+# make demo | test | check | bench | fuzz | campaign: each does its own set-up, into ./.venv
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,7 +9,7 @@ PIP = $(if $(shell command -v uv),VIRTUAL_ENV="$(CURDIR)/$(VENV)" uv pip install
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo test check bench campaign setup clean prerequisites
+.PHONY: demo test check bench fuzz campaign setup clean prerequisites
 
 demo: $(READY)
 	$(BIN)/robotd demo --out out/demo
@@ -28,13 +28,18 @@ check: $(DEV)
 bench: $(READY)
 	$(BIN)/python -m tests.bench
 
+# half a minute of coverage-guided fuzzing; ten minutes of it are in the campaign
+fuzz: $(DEV)
+	$(BIN)/python -m tests.fuzz.fuzz_oi --seconds 30
+
 campaign: $(DEV)
-	HYPOTHESIS_PROFILE=campaign $(BIN)/python -m pytest tests tests/campaign/surveys.py
+	HYPOTHESIS_PROFILE=campaign $(BIN)/python -m pytest tests tests/campaign/*.py
+	$(BIN)/python -m tests.fuzz.fuzz_oi --seconds 600
 
 setup: $(DEV)
 
 # the stamps are written last: what was left half made is made again
-$(READY): pyproject.toml setup.py $(wildcard cython/*.pyx) | prerequisites
+$(READY): pyproject.toml setup.py $(wildcard cython/*.pyx cython/*.pxi) | prerequisites
 	rm -f $(READY) $(DEV)
 	test -x $(BIN)/pip || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
 	$(PIP) 'setuptools>=69' 'cython>=3.0.10' 'numpy>=2.0'
@@ -48,6 +53,7 @@ $(DEV): $(READY)
 	else \
 	    echo "note: without pkg-config and libsystemd-dev, systemd-python is left out (robotd has a fallback)"; \
 	fi
+	$(PIP) --only-binary :all: 'atheris>=3.0' || echo "note: no wheel of atheris for this platform; make fuzz does nothing"
 	touch $(DEV)
 
 prerequisites:

@@ -9,6 +9,7 @@ PACKAGES = [
     "robotd",
     "robotd.drivers",
     "robotd.geometry",
+    "robotd.roomba",
     "robotd.server",
     "robotd.sim",
     "robotd.solver",
@@ -19,8 +20,12 @@ PACKAGES = [
 KERNELS = {
     "stroke": "robotd.vision._stroke",
     "cluster": "robotd.vision._cluster",
+    "polyline": "robotd.vision._polyline",
+    "measure": "robotd.vision._measure",
     "blink": "robotd.vision._blink",
     "sensor": "robotd.sim._sensor",
+    "bundle": "robotd.solver._bundle",
+    "rays": "robotd.solver._rays",
 }
 
 
@@ -59,9 +64,9 @@ setup(
     package_dir={"robotd.drivers": "drivers"},
     package_data={"robotd": ["py.typed", "*/*.pyi", "*/*.html"]},
     data_files=[
-        ("share/robotd/etc", ["etc/robotd.toml"]),
+        ("share/robotd/etc", ["etc/robotd.toml", "etc/60-robotd.rules"]),
         ("share/robotd/etc/stores", sorted(str(path) for path in Path("etc/stores").glob("*.toml"))),
-        ("share/robotd/systemd", ["systemd/robotd.service"]),
+        ("share/robotd/systemd", sorted(str(path) for path in Path("systemd").iterdir())),
     ],
     ext_modules=kernels(),
     options={"build_ext": {"parallel": os.cpu_count() or 1}},

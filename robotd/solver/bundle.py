@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import scipy.linalg
@@ -18,7 +18,11 @@ import scipy.sparse
 
 from ..geometry.transforms import heading_matrix, pose_matrix, rotation_matrix, skew, wrap_angle
 from ..records import Floats
+from .kernel import SHAPES, compiled
 from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Problem, Sightings, State
+
+if TYPE_CHECKING:
+    from ._bundle import Bundle
 
 _UNSEEN = 1e4  # whitened residual given to a sighting of a point behind its camera
 _NEAREST_M = 0.1  # a point at a camera's centre would explain any pixel, and no label is inside the robot
@@ -74,6 +78,16 @@ class Linear:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """The whitened residuals of `Linear` without derivatives."""
+
+    residual: Floats
+    valid: Bools
+    move: Floats
+    roof: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Normal:
     """Normal equations: frame block `H` (n, n), point blocks `V` (l, 3, 3), sparse coupling `W` (n, 3 l), gradients."""
 
@@ -111,18 +125,27 @@ class Adjustment:
         self.columns: Ints = np.where(problem.free, np.cumsum(problem.free) - 1, -1)
         self.size = int(np.count_nonzero(problem.free))
         finite = problem.free & np.isfinite(problem.prior_sigma)
-        self._prior = np.where(finite, 1.0 / np.where(finite, problem.prior_sigma, 1.0) ** 2, 0.0)
-        self.labels, self.point = np.unique(s.label, return_inverse=True)
-        self.point = self.point.ravel()
-        # frame entries that each sighting depends on: its stop's, then its camera's
-        base = STOP * problem.stop_count
-        self.entries: Ints = np.concatenate(
+        self.information = np.where(finite, 1.0 / np.where(finite, problem.prior_sigma, 1.0) ** 2, 0.0)
+        seen = np.bincount(s.label, minlength=len(problem.labels)) > 0
+        self.labels: Ints = np.flatnonzero(seen)
+        self.point: Ints = (np.cumsum(seen) - 1)[s.label]
+        self.camera_slices = [slice(*np.searchsorted(s.camera, [c, c + 1])) for c in range(len(problem.cameras))]
+        self.move_roots: Floats = np.linalg.inv(np.linalg.cholesky(problem.moves.covariance))
+        self.known_here: Ints = np.flatnonzero(seen[problem.known.label])
+        self.known_point: Ints = np.searchsorted(self.labels, problem.known.label[self.known_here])
+
+    @cached_property
+    def kernel(self) -> Bundle | None:
+        """The same problem compiled, if it can be; what is done here in numpy is then done there."""
+        return compiled(self)
+
+    @cached_property
+    def entries(self) -> Ints:
+        """(N, 15) frame entries that each sighting depends on: its stop's, then its camera's."""
+        s, base = self.sightings, STOP * self.problem.stop_count
+        return np.concatenate(
             [STOP * s.stop[:, None] + np.arange(STOP), base + CAMERA * s.camera[:, None] + np.arange(CAMERA)], axis=1
         )
-        self.camera_slices = [slice(*np.searchsorted(s.camera, [c, c + 1])) for c in range(len(problem.cameras))]
-        self._move_roots = np.array([np.linalg.inv(np.linalg.cholesky(c)) for c in problem.moves.covariance])
-        self._known_here = np.flatnonzero(np.isin(problem.known.label, self.labels))
-        self._known_point = np.searchsorted(self.labels, problem.known.label[self._known_here])
 
     @cached_property
     def _pattern(self) -> tuple[Bools, Ints, Ints]:
@@ -130,6 +153,18 @@ class Adjustment:
         columns = np.repeat(self.columns[self.entries][:, None], 2, axis=1)
         kept = columns >= 0
         return kept, columns[kept], np.concatenate([[0], np.cumsum(kept.sum(axis=2).ravel())])
+
+    def residuals(self, state: State, loss: Loss) -> Residuals:
+        """Residuals alone, by the kernel if there is one."""
+        if self.kernel is None:
+            linear = self.linearise(state, loss)
+            return Residuals(linear.residual, linear.valid, linear.move, linear.roof)
+        poses = self.problem.stop_entries(state)
+        residual, valid = self.kernel.residuals(state.frame, state.points[self.labels], loss.sigma_px)
+        roofs = self.problem.roofs.stop
+        R_stop = np.zeros((len(poses), 3, 3))
+        R_stop[roofs] = pose_matrix(*poses[roofs].T)[:, :3, :3]
+        return Residuals(residual, valid, self._linear_moves(poses, state)[0], self._linear_roofs(poses, R_stop)[0])
 
     def linearise(self, state: State, loss: Loss) -> Linear:
         """Residuals and analytic derivatives at a state."""
@@ -202,7 +237,7 @@ class Adjustment:
         before[:, 0, 2], before[:, 1, 2] = shift[:, 1], -shift[:, 0]
         factor = np.zeros((len(a), 3, ODOMETRY))
         factor[:, :2, 0], factor[:, 2, 1] = -moves.measured[:, :2], -moves.measured[:, 2]
-        L = self._move_roots
+        L = self.move_roots
         return (L @ residual[:, :, None])[:, :, 0], L @ before, L @ after, L @ factor
 
     def _linear_roofs(self, poses: Floats, R_stop: Floats) -> tuple[Floats, Floats]:
@@ -226,7 +261,7 @@ class Adjustment:
         return (pixels - roofs.uv) / roofs.sigma[:, None], by_stop / roofs.sigma[:, None, None]
 
     def _known_residual(self, state: State) -> Floats:
-        known, here = self.problem.known, self._known_here
+        known, here = self.problem.known, self.known_here
         return np.asarray((state.points[known.label[here]] - known.position[here]) / known.sigma[here, None])
 
     def cost(self, linear: Linear, state: State, loss: Loss) -> float:
@@ -235,7 +270,7 @@ class Adjustment:
         moves, _ = _cauchy((linear.move**2).sum(axis=1), loss.move_width)
         roofs, _ = _cauchy((linear.roof**2).sum(axis=1), loss.move_width)
         known, _ = _cauchy((self._known_residual(state) ** 2).sum(axis=1), loss.move_width)
-        prior = self._prior @ state.frame**2
+        prior = self.information @ state.frame**2
         return 0.5 * float(self.sightings.probability @ rho + moves.sum() + roofs.sum() + known.sum() + prior)
 
     def normal(self, linear: Linear, state: State, loss: Loss) -> Normal:
@@ -259,19 +294,17 @@ class Adjustment:
         np.add.at(V, self.point, by_point.transpose(0, 2, 1) @ by_point)
         gradient = J_frame_t @ r
         point_gradient = (J_point.T @ r).reshape(-1, 3)
-        if len(self._known_here):
+        if len(self.known_here):
             residual = self._known_residual(state)
             _, weight = _cauchy((residual**2).sum(axis=1), loss.move_width)
-            information = weight / self.problem.known.sigma[self._known_here] ** 2
-            V[self._known_point] += information[:, None, None] * np.eye(3)
-            point_gradient[self._known_point] += (
-                residual * (weight / self.problem.known.sigma[self._known_here])[:, None]
-            )
+            information = weight / self.problem.known.sigma[self.known_here] ** 2
+            V[self.known_point] += information[:, None, None] * np.eye(3)
+            point_gradient[self.known_point] += residual * (weight / self.problem.known.sigma[self.known_here])[:, None]
         self._add_moves(H, gradient, linear, loss)
         self._add_roofs(H, gradient, linear, loss)
         free = self.problem.free
-        H[np.diag_indices(self.size)] += self._prior[free]
-        gradient += (self._prior * state.frame)[free]
+        H[np.diag_indices(self.size)] += self.information[free]
+        gradient += (self.information * state.frame)[free]
         return Normal(H, V, W, gradient, point_gradient)
 
     def _add_moves(self, H: Floats, gradient: Floats, linear: Linear, loss: Loss) -> None:
@@ -331,6 +364,24 @@ class Adjustment:
         tolerance : float
             In units of the cost; not relative, because the weak modes of scale and heading move the cost very little.
         """
+        if self.kernel is None:
+            return self.solve_reference(state, loss, iterations, tolerance)
+        frame, moved, cost, spent, converged = self.kernel.solve(
+            state.frame,
+            state.points[self.labels],
+            SHAPES[loss.shape],
+            loss.sigma_px,
+            loss.width,
+            loss.move_width,
+            iterations,
+            tolerance,
+        )
+        points = state.points.copy()
+        points[self.labels] = moved
+        return Solution(replace(state, frame=frame, points=points), cost, spent, converged)
+
+    def solve_reference(self, state: State, loss: Loss, iterations: int = 30, tolerance: float = 1e-3) -> Solution:
+        """`solve` in numpy, whether or not there is a kernel."""
         damping, linear = 1e-4, self.linearise(state, loss)
         cost = self.cost(linear, state, loss)
         normal = self.normal(linear, state, loss)

@@ -28,6 +28,16 @@ class Covariance:
 
 def covariance(adjustment: Adjustment, state: State) -> Covariance:
     """Covariances at the least-squares optimum, from the inverse of the normal matrix."""
+    kernel = adjustment.kernel
+    found = None if kernel is None else kernel.covariance(state.frame, state.points[adjustment.labels])
+    if found is None:  # also where the matrix is nearly singular, because eigenvalues tell what is barely known
+        return covariance_reference(adjustment, state)
+    points, stops, leverage = found
+    return Covariance(points, stops, np.clip(leverage, 0.0, 2.0))
+
+
+def covariance_reference(adjustment: Adjustment, state: State) -> Covariance:
+    """`covariance` in numpy, with a dense inverse."""
     problem = adjustment.problem
     linear = adjustment.linearise(state, SQUARE)
     S, V_inverse, WV = adjustment.eliminate(adjustment.normal(linear, state, SQUARE))

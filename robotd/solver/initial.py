@@ -11,11 +11,19 @@ of rays (erratum A12: the thesis's labels "on the opposite side of the robot" ar
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..geometry.transforms import heading_matrix, pose_matrix, rotation_matrix, se2_compose, wrap_angle
 from ..records import Floats
 from .problem import Bools, Ints, Problem, Sightings, State
+
+kernel: Any
+try:
+    from . import _rays as kernel
+except ImportError:  # built without extensions
+    kernel = None
 
 FARTHEST_M = 60.0  # a label's light is lost in the noise long before
 FLOOR_M = -0.10  # a point lower than this is a reflection in the floor that the robot drives on
@@ -68,15 +76,61 @@ def triangulate(
     points, found = np.zeros((label_count, 3)), np.zeros(label_count, dtype=np.bool_)
     order = np.argsort(label, kind="stable")
     counts = np.bincount(label, minlength=label_count)
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    starts = np.cumsum(counts) - counts
     seen = counts > 0
     first = order[starts[seen]]
     points[seen] = origin[first] + _FALLBACK_M * direction[first]
+    if kernel is None:
+        _vote(origin, direction, stop, weight, order, starts, counts, tolerance, points, found)
+        return points, found
+    pairs = {n: _pairs(n) for n in np.unique(counts[counts >= 2]).tolist()}
+    sizes = np.zeros(int(counts.max(initial=0)) + 2, dtype=np.int64)
+    sizes[[n + 1 for n in pairs]] = [len(i) for i, _ in pairs.values()]
+    nothing = np.zeros(0, dtype=np.int64)
+    kernel.vote(
+        np.ascontiguousarray(origin),
+        np.ascontiguousarray(direction),
+        np.asarray(weight, dtype=np.float64),
+        stop,
+        order,
+        np.concatenate([starts, [len(order)]]),
+        np.cumsum(sizes),
+        np.concatenate([nothing, *(i for i, _ in pairs.values())]),
+        np.concatenate([nothing, *(j for _, j in pairs.values())]),
+        tolerance,
+        np.sin(_LEAST_PARALLAX),
+        FARTHEST_M,
+        FLOOR_M,
+        points,
+        found.view(np.uint8),
+    )
+    return points, found
+
+
+def _pairs(n: int) -> tuple[Ints, Ints]:
+    """Pairs of n rays to try."""
+    i, j = np.triu_indices(n, 1)
+    if len(i) > _MOST_PAIRS:
+        chosen = np.linspace(0, len(i) - 1, _MOST_PAIRS).astype(np.int64)
+        i, j = i[chosen], j[chosen]
+    return i, j
+
+
+def _vote(
+    origin: Floats,
+    direction: Floats,
+    stop: Ints,
+    weight: Floats,
+    order: Ints,
+    starts: Ints,
+    counts: Ints,
+    tolerance: float,
+    points: Floats,
+    found: Bools,
+) -> None:
+    """The vote in numpy, into `points` and `found`, all labels with equally many rays at once."""
     for n in np.unique(counts[counts >= 2]):
-        i, j = np.triu_indices(n, 1)
-        if len(i) > _MOST_PAIRS:
-            chosen = np.linspace(0, len(i) - 1, _MOST_PAIRS).astype(np.int64)
-            i, j = i[chosen], j[chosen]
+        i, j = _pairs(int(n))
         for some in np.array_split(which := np.flatnonzero(counts == n), 1 + len(which) * len(i) * n // 1_000_000):
             rays = order[starts[some][:, None] + np.arange(n)]
             X, usable = _meet(origin[rays], direction[rays], i, j)
@@ -91,7 +145,6 @@ def triangulate(
             good = np.isfinite(score[np.arange(len(some)), best])
             points[some[good]] = X[np.arange(len(some)), best][good]
             found[some[good]] = True
-    return points, found
 
 
 def _meet(origin: Floats, direction: Floats, i: Ints, j: Ints) -> tuple[Floats, Bools]:
@@ -118,14 +171,12 @@ def epipolar_moves(problem: Problem, sightings: Sightings) -> Floats:
     a, b, owner = _common_rays(moves.before, moves.after, sightings)
     if len(owner) == 0:
         return moves.measured.copy()
-    rays = (sightings.origin[a], sightings.direction[a], sightings.origin[b], sightings.direction[b])
+    rays = _RayPairs(sightings, a, b, owner, len(moves.before))
     root = np.linalg.inv(np.linalg.cholesky(moves.covariance))
-    count = len(moves.before)
 
     def losses(move: Floats) -> Floats:
-        miss = _miss(*rays, move[owner]) / _RAY_SIGMA
         prior = ((root @ (move - moves.measured)[:, :, None]) ** 2).sum(axis=(1, 2))
-        return np.asarray(np.bincount(owner, np.log1p(miss**2), count) + 9.0 * np.log1p(prior / 9.0))
+        return np.asarray(rays.losses(move) + 9.0 * np.log1p(prior / 9.0))
 
     sigma = np.sqrt(np.diagonal(moves.covariance, axis1=1, axis2=2))
     distance = np.maximum(np.hypot(moves.measured[:, 0], moves.measured[:, 1]), 0.05)
@@ -140,9 +191,9 @@ def epipolar_moves(problem: Problem, sightings: Sightings) -> Floats:
             cost = losses(trial)
             best[cost < lowest] = trial[cost < lowest]
             lowest = np.minimum(cost, lowest)
-    damping = np.full(count, 1e-3)
+    damping = np.full(len(moves.before), 1e-3)
     for _ in range(18):
-        trial = best + _epipolar_step(rays, owner, best, moves.measured, root, damping)
+        trial = best + _epipolar_step(rays, best, moves.measured, root, damping)
         cost = losses(trial)
         better = cost < lowest
         best[better], lowest[better] = trial[better], cost[better]
@@ -152,20 +203,57 @@ def epipolar_moves(problem: Problem, sightings: Sightings) -> Floats:
 
 
 def _common_rays(before: Ints, after: Ints, sightings: Sightings) -> tuple[Ints, Ints, Ints]:
-    """Pairs of sightings of one label from the two stops of each move, and the move they belong to."""
-    by_stop: dict[int, list[int]] = {}
-    for i, stop in enumerate(sightings.stop.tolist()):
-        by_stop.setdefault(stop, []).append(i)
-    first, second, owner = [], [], []
-    for m, (f, g) in enumerate(zip(before.tolist(), after.tolist(), strict=True)):
-        here, there = np.array(by_stop.get(f, []), dtype=np.int64), np.array(by_stop.get(g, []), dtype=np.int64)
-        p, q = np.nonzero(sightings.label[here][:, None] == sightings.label[there][None])
-        first.append(here[p])
-        second.append(there[q])
-        owner.append(np.full(len(p), m))
-    if not owner:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return np.concatenate(first), np.concatenate(second), np.concatenate(owner)
+    """Pairs of sightings of one label from the two stops of each move, and the move they belong to, ascending."""
+    order = np.lexsort((sightings.label, sightings.stop))
+    key = sightings.stop[order] * (labels := int(sightings.label.max(initial=0)) + 1) + sightings.label[order]
+    begins = np.searchsorted(sightings.stop[order], before), np.searchsorted(sightings.stop[order], before + 1)
+    counts = begins[1] - begins[0]
+    owner = np.repeat(np.arange(len(before)), counts)
+    first = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(begins[0], counts)
+    wanted = after[owner] * labels + sightings.label[order[first]]
+    low, high = np.searchsorted(key, wanted), np.searchsorted(key, wanted, side="right")
+    matches = high - low
+    nth = np.arange(int(matches.sum())) - np.repeat(np.cumsum(matches) - matches, matches)
+    second = np.repeat(low, matches) + nth
+    return order[np.repeat(first, matches)], order[second], np.repeat(owner, matches)
+
+
+class _RayPairs:
+    """Pairs of rays, by the move that leads from the stop of one to that of the other."""
+
+    def __init__(self, sightings: Sightings, first: Ints, second: Ints, owner: Ints, moves: int) -> None:
+        self.first, self.second, self.owner = first, second, owner
+        self.begins: Ints = np.searchsorted(owner, np.arange(moves + 1))
+        self.origin, self.direction = np.ascontiguousarray(sightings.origin), np.ascontiguousarray(sightings.direction)
+        a, b = first, second
+        self.rays = (self.origin[a], self.direction[a], self.origin[b], self.direction[b])
+
+    def losses(self, move: Floats) -> Floats:
+        """Loss (M,) of how the rays miss each other."""
+        count = len(self.begins) - 1
+        if kernel is not None:
+            loss = np.zeros(count)
+            kernel.losses(self.origin, self.direction, self.first, self.second, self.begins, move, _RAY_SIGMA, loss)
+            return loss
+        miss = _miss(*self.rays, move[self.owner]) / _RAY_SIGMA
+        return np.asarray(np.bincount(self.owner, np.log1p(miss**2), count))
+
+    def normal(self, move: Floats) -> tuple[Floats, Floats]:
+        """Reweighted normal matrices (M, 3, 3) and gradients (M, 3)."""
+        H, g = np.zeros((len(move), 3, 3)), np.zeros((len(move), 3))
+        if kernel is not None:
+            kernel.slopes(self.origin, self.direction, self.first, self.second, self.begins, move, _RAY_SIGMA, H, g)
+            return H, g
+        miss = _miss(*self.rays, move[self.owner]) / _RAY_SIGMA
+        J = np.empty((len(miss), 3))
+        for k in range(3):
+            ahead = move.copy()
+            ahead[:, k] += 1e-6
+            J[:, k] = (_miss(*self.rays, ahead[self.owner]) / _RAY_SIGMA - miss) / 1e-6
+        weight = 1.0 / (1.0 + miss**2)
+        np.add.at(H, self.owner, weight[:, None, None] * J[:, :, None] * J[:, None])
+        np.add.at(g, self.owner, (weight * miss)[:, None] * J)
+        return H, g
 
 
 def _miss(origin_a: Floats, a: Floats, origin_b: Floats, b: Floats, move: Floats) -> Floats:
@@ -180,24 +268,8 @@ def _miss(origin_a: Floats, a: Floats, origin_b: Floats, b: Floats, move: Floats
     return np.asarray(volume / np.sqrt(slope + 1e-6))
 
 
-def _epipolar_step(
-    rays: tuple[Floats, Floats, Floats, Floats],
-    owner: Ints,
-    move: Floats,
-    measured: Floats,
-    root: Floats,
-    damping: Floats,
-) -> Floats:
-    miss = _miss(*rays, move[owner]) / _RAY_SIGMA
-    J = np.empty((len(owner), 3))
-    for k in range(3):
-        ahead = move.copy()
-        ahead[:, k] += 1e-6
-        J[:, k] = (_miss(*rays, ahead[owner]) / _RAY_SIGMA - miss) / 1e-6
-    weight = 1.0 / (1.0 + miss**2)
-    H, g = np.zeros((len(move), 3, 3)), np.zeros((len(move), 3))
-    np.add.at(H, owner, weight[:, None, None] * J[:, :, None] * J[:, None])
-    np.add.at(g, owner, (weight * miss)[:, None] * J)
+def _epipolar_step(rays: _RayPairs, move: Floats, measured: Floats, root: Floats, damping: Floats) -> Floats:
+    H, g = rays.normal(move)
     residual = (root @ (move - measured)[:, :, None])[:, :, 0]
     prior_weight = 9.0 / (9.0 + (residual**2).sum(axis=1))
     root_t = root.transpose(0, 2, 1) * prior_weight[:, None, None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,7 +25,7 @@ from ..records import (
 from .bundle import SQUARE, Adjustment
 from .initial import world_rays
 from .linear import solve_linear
-from .problem import Bools, Problem, build_problem
+from .problem import Bools, Problem, Sightings, build_problem
 from .robust import OUTLIER, Optimum, optimise
 
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
@@ -68,11 +68,11 @@ def solve(survey: Survey, method: Literal["bundle", "linear"] = "bundle") -> Map
 def _to_map(asked: Problem, optimum: Optimum) -> Map:
     problem, state = optimum.problem, optimum.state
     everything = Adjustment(problem, problem.sightings)
-    linear = everything.linearise(state, SQUARE)
+    linear = everything.residuals(state, SQUARE)
     square = (linear.residual**2).sum(axis=1)
     counts = Counter(s.label for stop in problem.survey.stops for s in stop.sightings)
-    in_front = _in_front(optimum)
-    labels = tuple(_label(asked, optimum, i, counts[label], in_front[i]) for i, label in enumerate(problem.labels))
+    tally = _tally(asked, optimum)
+    labels = tuple(_label(asked, optimum, tally, i, counts[label]) for i, label in enumerate(problem.labels))
     located = {m.label for m in labels if m.status in ("placed", "known")}
     residual_px = linear.residual * problem.sightings.sigma[:, None]
     inlier = optimum.inlier
@@ -100,33 +100,80 @@ def _to_map(asked: Problem, optimum: Optimum) -> Map:
     )
 
 
-def _label(asked: Problem, optimum: Optimum, i: int, count: int, in_front: Floats) -> MappedLabel:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tally:
+    """Of every label: how many stops saw it, saw it from where the map reaches, and agree; and what speaks for it.
+
+    `row` is its place in the adjustment or -1, `known` in the problem's known labels or -1, `sigma` its largest
+    standard deviation, `agreeing` and `doubting` sums of its sightings' probabilities, `in_front` (L, 3) see _in_front.
+    """
+
+    asked_stops: list[int]
+    stops: list[int]
+    inliers: list[int]
+    agreeing_stops: list[int]
+    agreeing: list[float]
+    doubting: list[float]
+    row: list[int]
+    known: list[int]
+    sigma: list[float]
+    in_front: Floats
+    image: list[bool]
+
+
+def _tally(asked: Problem, optimum: Optimum) -> _Tally:
+    problem, s, inlier = optimum.problem, optimum.problem.sightings, optimum.inlier
+    count, odd = len(problem.labels), ~optimum.inlier & ~optimum.reflected
+    row, known = np.full(count, -1), np.full(count, -1)
+    row[optimum.adjustment.labels] = np.arange(len(optimum.adjustment.labels))
+    known[problem.known.label[::-1]] = np.arange(len(problem.known.label))[::-1]
+    sigma = np.full(count, np.inf)
+    if len(points := optimum.covariance.points):
+        sigma[optimum.adjustment.labels] = np.sqrt(np.linalg.eigvalsh(points)[:, -1])
+    in_front = _in_front(optimum)
+    image: list[bool] = np.isfinite(in_front[:, 0]).tolist()
+
+    def stops(sightings: Sightings) -> list[int]:
+        pairs = np.unique(sightings.label * problem.stop_count + sightings.stop)
+        counts: list[int] = np.bincount(pairs // problem.stop_count, minlength=count).tolist()
+        return counts
+
+    return _Tally(
+        asked_stops=stops(asked.sightings),
+        stops=stops(s),
+        inliers=np.bincount(s.label[inlier], minlength=count).tolist(),
+        agreeing_stops=stops(s.select(inlier)),
+        agreeing=np.bincount(s.label[inlier], s.probability[inlier], count).tolist(),
+        doubting=np.bincount(s.label[odd], s.probability[odd], count).tolist(),
+        row=row.tolist(),
+        known=known.tolist(),
+        sigma=sigma.tolist(),
+        in_front=in_front,
+        image=image,
+    )
+
+
+def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int) -> MappedLabel:
     problem, label = optimum.problem, asked.labels[i]
-    mine = problem.sightings.label == i
-    all_stops = set(asked.sightings.stop[asked.sightings.label == i].tolist())
-    inliers = int(np.count_nonzero(mine & optimum.inlier))
+    inliers = tally.inliers[i]
     position, covariance = _vector(optimum.state.points[i]), None
-    at = int(np.searchsorted(optimum.adjustment.labels, i))
-    adjusted = at < len(optimum.adjustment.labels) and optimum.adjustment.labels[at] == i
-    if adjusted:
-        covariance = optimum.covariance.points[at]
+    if tally.row[i] >= 0:
+        covariance = optimum.covariance.points[tally.row[i]]
 
     def unplaced(reason: str) -> MappedLabel:
         return MappedLabel(label, "unplaced", None, None, count, inliers, reason)
 
-    known = np.flatnonzero(problem.known.label == i)
-    if len(known):
-        k = int(known[0])
+    if (k := tally.known[i]) >= 0:
         if covariance is None:
             position, covariance = _vector(problem.known.position[k]), problem.known.sigma[k] ** 2 * np.eye(3)
         return MappedLabel(label, "known", position, _matrix(covariance), count, inliers)
     if count == 0:
         return unplaced("its measured position was rejected and no camera saw it; measure it again")
-    if not all_stops:
+    if tally.asked_stops[i] == 0:
         return unplaced("every sighting lies beyond the lens model's valid radius; map it from another stop")
-    if len(all_stops) == 1:
+    if tally.asked_stops[i] == 1:
         return unplaced("seen from one stop only; map it from a second stop")
-    if not mine.any() or len(set(problem.sightings.stop[mine].tolist())) < 2:
+    if tally.stops[i] < 2:
         return unplaced("seen only from stops that could not be joined to the map; map it together with mapped labels")
     lead = optimum.gain[i] - optimum.rival_gain[i]
     if np.isfinite(optimum.rival_points[i, 0]) and lead < _TIE and optimum.rival_gain[i] > _TIE * optimum.gain[i]:
@@ -135,16 +182,14 @@ def _label(asked: Problem, optimum: Optimum, i: int, count: int, in_front: Float
         return unplaced(
             f"its {count} sightings do not meet in one point (reflections or wrong identities); flash it again, alone"
         )
-    agreeing = len(set(problem.sightings.stop[mine & optimum.inlier].tolist()))
-    doubt = problem.sightings.probability[mine & ~optimum.inlier & ~optimum.reflected].sum()
-    if agreeing < _TRUSTED_STOPS and doubt >= problem.sightings.probability[mine & optimum.inlier].sum():
+    if tally.agreeing_stops[i] < _TRUSTED_STOPS and tally.doubting[i] >= tally.agreeing[i]:
         return unplaced(f"only {inliers} of its {count} sightings agree, which may be chance; flash it again, alone")
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    sigma = tally.sigma[i]
     if not sigma <= WIDEST_SIGMA_M:
         return unplaced(f"views nearly parallel (standard deviation {sigma:.2g} m); map it from a stop further aside")
-    if np.isfinite(in_front).all():
+    if tally.image[i]:
         reason = "perhaps an image in glass: one sighting puts the label nearer; map it from another stop"
-        return _ambiguous(optimum, i, label, count, inliers, in_front, reason)
+        return _ambiguous(optimum, i, label, count, inliers, tally.in_front[i], reason)
     return MappedLabel(label, "placed", position, _matrix(covariance), count, inliers)
 
 
@@ -198,7 +243,7 @@ def _ambiguous(
     for point in (state.points[i], other):
         points = state.points.copy()
         points[i] = point
-        linear = mine.linearise(replace(state, points=points), SQUARE)
+        linear = mine.residuals(replace(state, points=points), SQUARE)
         # a sighting of the other candidate counts as an outlier, so that the costs can be compared
         cost = 0.5 * np.minimum((linear.residual**2).sum(axis=1), OUTLIER).sum()
         candidates.append(Candidate(_vector(point), float(cost)))
@@ -225,14 +270,17 @@ def _stops(optimum: Optimum) -> tuple[MappedStop, ...]:
 def _sightings(
     problem: Problem, residual_px: Floats, valid: Bools, weight: Floats, located: set[str]
 ) -> tuple[MappedSighting, ...]:
-    row_of = {int(source): row for row, source in enumerate(problem.sightings.source)}
+    rows: dict[int, int] = {source: row for row, source in enumerate(problem.sightings.source.tolist())}
+    residuals, shown, shares = residual_px.tolist(), valid.tolist(), weight.tolist()
     result = []
     everything = ((stop, s) for stop in problem.survey.stops for s in stop.sightings)
     for number, (stop, s) in enumerate(everything):
-        row = row_of.get(number)
-        shown = row is not None and s.label in located and bool(valid[row])
-        residual = (float(residual_px[row, 0]), float(residual_px[row, 1])) if shown else None
-        share = float(weight[row]) if row is not None else 0.0
+        row = rows.get(number, -1)
+        residual = None
+        if row >= 0 and shown[row] and s.label in located:
+            u, v = residuals[row]
+            residual = (u, v)
+        share = shares[row] if row >= 0 else 0.0
         result.append(MappedSighting(stop.leg, stop.stop, s.camera, s.label, residual, share))
     return tuple(result)
 
@@ -243,5 +291,5 @@ def _vector(values: Floats) -> Vector3:
 
 
 def _matrix(values: Floats) -> Matrix3:
-    a, b, c = values
-    return (_vector(a), _vector(b), _vector(c))
+    (a, b, c), (d, e, f), (g, h, i) = values.tolist()
+    return ((a, b, c), (d, e, f), (g, h, i))

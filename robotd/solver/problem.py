@@ -195,7 +195,7 @@ def build_problem(survey: Survey) -> Problem:
 def _check(survey: Survey) -> None:
     problems: list[str] = []
     names = [camera.name for camera in survey.rig.cameras]
-    roofs = {roof.name for roof in survey.roof_cameras}
+    known_names, roofs = set(names), {roof.name for roof in survey.roof_cameras}
     where = f"survey {survey.survey}"
     if len(set(names)) < len(names):
         problems.append(f"{where}: two cameras of the rig have the same name; names are {', '.join(names)}")
@@ -226,7 +226,15 @@ def _check(survey: Survey) -> None:
             problems.append(f"{at}: odometry and move must be finite numbers, got {stop.odometry} and {stop.move}")
         elif stop.move is not None and np.linalg.eigvalsh(np.array(stop.move.covariance)).min() < -1e-9:
             problems.append(f"{at}: the move's covariance is not positive semidefinite")
-        for s in stop.sightings:
+        # all numbers at once, because a large survey has a hundred thousand sightings
+        rows = np.array(
+            [(s.u, s.v, 1.0 if s.sigma_px is None else s.sigma_px, s.probability or 0.0) for s in stop.sightings]
+        )
+        if not len(rows) or (np.isfinite(rows).all() and (rows[:, 2] > 0.0).all()):
+            wrong = tuple(s for s in stop.sightings if s.camera not in known_names)
+        else:
+            wrong = stop.sightings
+        for s in wrong:
             if s.camera not in names and s.camera not in unknown:
                 unknown.add(s.camera)
                 expected = ", ".join(names) or "no cameras"
@@ -248,7 +256,7 @@ def _sightings(survey: Survey, cameras: tuple[Camera, ...], labels: list[str]) -
     label_index = {label: i for i, label in enumerate(labels)}
     rows = [(f, s) for f, stop in enumerate(survey.stops) for s in stop.sightings]
     default = survey.sigmas.pixel_px if survey.sigmas.pixel_px > 0.0 else 1.0
-    stop = np.array([f for f, _ in rows], dtype=np.int64)
+    stop = np.repeat(np.arange(len(survey.stops)), [len(stop.sightings) for stop in survey.stops])
     camera = np.array([camera_index[s.camera] for _, s in rows], dtype=np.int64)
     label = np.array([label_index[s.label] for _, s in rows], dtype=np.int64)
     uv = np.array([[s.u, s.v] for _, s in rows]).reshape(-1, 2)
@@ -267,7 +275,7 @@ def _sightings(survey: Survey, cameras: tuple[Camera, ...], labels: list[str]) -
             f"{np.count_nonzero(~usable)} of {len(rows)} sightings lie where the lens model cannot be inverted "
             "(beyond its valid radius) and were not used"
         )
-    _, rival = np.unique(np.column_stack([stop, camera, label]), axis=0, return_inverse=True)
+    _, rival = np.unique((stop * len(cameras) + camera) * (len(labels) + 1) + label, return_inverse=True)
     everything = Sightings(
         stop=stop,
         camera=camera,

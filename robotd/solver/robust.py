@@ -139,7 +139,7 @@ def _ray_tolerance(problem: Problem) -> float:
 def _explained(problem: Problem, placement: Placement, state: State) -> float:
     attached = detach(problem, placement.placed)
     adjustment = Adjustment(attached, attached.sightings)
-    _, weight = _REFERENCE((adjustment.linearise(state, _REFERENCE).residual ** 2).sum(axis=1))
+    _, weight = _REFERENCE((adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1))
     return float((weight > 0.25).mean()) if len(weight) else 1.0
 
 
@@ -208,14 +208,14 @@ def _least_squares(problem: Problem, state: State) -> tuple[Problem, State, Bool
 def explained(everything: Adjustment, state: State) -> Bools:
     """Which sightings the state explains: at most one of each group of rivals, labels only from two stops or more."""
     problem, sightings = everything.problem, everything.sightings
-    linear = everything.linearise(state, SQUARE)
+    linear = everything.residuals(state, SQUARE)
     square = (linear.residual**2).sum(axis=1)
     good = linear.valid & (square < OUTLIER)
     best = np.full(int(sightings.rival.max(initial=-1)) + 1, np.inf)
     np.minimum.at(best, sightings.rival, square)
     good &= square <= best[sightings.rival]
-    pairs = np.unique(np.column_stack([sightings.label[good], sightings.stop[good]]), axis=0)
-    stops = np.bincount(pairs[:, 0], minlength=len(problem.labels))
+    pairs = np.unique(sightings.label[good] * problem.stop_count + sightings.stop[good])
+    stops = np.bincount(pairs // problem.stop_count, minlength=len(problem.labels))
     stops[problem.known.label] += 1
     return np.asarray(good & (stops[sightings.label] >= 2))
 
@@ -226,7 +226,7 @@ def _without_wrong(problem: Problem, state: State) -> Problem:
     Returns the problem itself if nothing was wrong.
     """
     everything = Adjustment(problem, problem.sightings)
-    linear = everything.linearise(state, SQUARE)
+    linear = everything.residuals(state, SQUARE)
     moves, known, notes = problem.moves, problem.known, list(problem.notes)
     slipped = (linear.move**2).sum(axis=1) > _SLIP
     if slipped.any():
@@ -269,9 +269,9 @@ def _without_known(problem: Problem, state: State, wrong: Ints) -> Problem:
 def _scatter(problem: Problem, state: State) -> float:
     """By how much explained sightings scatter more than their sigma says, from the median; at least 1."""
     adjustment = Adjustment(problem, problem.sightings)
-    slack = (adjustment.linearise(state, _REFERENCE).residual ** 2).sum(axis=1)
+    slack = (adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1)
     near = slack < _REFERENCE.width**2
-    square = (adjustment.linearise(state, SQUARE).residual[near] ** 2).sum(axis=1)
+    square = (adjustment.residuals(state, SQUARE).residual[near] ** 2).sum(axis=1)
     unknowns = 3 * len(np.unique(problem.sightings.label[near]))
     spare = 2 * len(square) - unknowns
     if spare < 20:
@@ -285,7 +285,7 @@ def _excess(adjustment: Adjustment, state: State, sure: Covariance) -> float:
     expected = float((2.0 - sure.leverage).sum())
     if expected < 20.0:
         return 1.0
-    found = float((adjustment.linearise(state, SQUARE).residual ** 2).sum())
+    found = float((adjustment.residuals(state, SQUARE).residual ** 2).sum())
     ratio = found / expected
     return float(np.sqrt(ratio)) if ratio > 1.0 + 3.0 * np.sqrt(2.0 / expected) else 1.0
 
@@ -377,8 +377,8 @@ def _hypotheses(problem: Problem, state: State, without: Bools | None = None) ->
     for loss in (Loss("geman-mcclure", 1.0), Loss("geman-mcclure")):
         trial = adjustment.solve(trial, loss, iterations=12, tolerance=1e-2).state
     rival_gain, fits = _support(everything, trial)
-    pairs = np.unique(np.column_stack([problem.sightings.label[fits], problem.sightings.stop[fits]]), axis=0)
-    found &= np.bincount(pairs[:, 0], minlength=count) >= 2
+    pairs = np.unique(problem.sightings.label[fits] * problem.stop_count + problem.sightings.stop[fits])
+    found &= np.bincount(pairs // problem.stop_count, minlength=count) >= 2
     found &= np.linalg.norm(trial.points - state.points, axis=1) > 0.05
     return gain, np.where(found[:, None], trial.points, np.nan), np.where(found, rival_gain, 0.0)
 
@@ -386,14 +386,14 @@ def _hypotheses(problem: Problem, state: State, without: Bools | None = None) ->
 def _in_floor(problem: Problem, state: State) -> Bools:
     """Which sightings lie where the floor would mirror their label; its tilt and waves move images by some pixels."""
     mirrored = replace(state, points=state.points * [1.0, 1.0, -1.0])
-    linear = Adjustment(problem, problem.sightings).linearise(mirrored, SQUARE)
+    linear = Adjustment(problem, problem.sightings).residuals(mirrored, SQUARE)
     miss = np.linalg.norm(linear.residual, axis=1) * problem.sightings.sigma
     return np.asarray(linear.valid & (miss < _FLOOR_IMAGE_PX))
 
 
 def _support(everything: Adjustment, state: State) -> tuple[Floats, Bools]:
     sightings = everything.sightings
-    square = (everything.linearise(state, SQUARE).residual ** 2).sum(axis=1)
+    square = (everything.residuals(state, SQUARE).residual ** 2).sum(axis=1)
     worth = sightings.probability * np.maximum(1.0 - square / OUTLIER, 0.0)
     groups, owner = np.unique(sightings.rival, return_inverse=True)
     best, label = np.zeros(len(groups)), np.zeros(len(groups), dtype=np.int64)

@@ -1,0 +1,161 @@
+"""Labels without a position: why, in words, and with candidates."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotd.geometry.camera import Camera
+from robotd.geometry.transforms import (
+    invert_rigid,
+    pose_matrix,
+    transform_points,
+)
+from robotd.records import (
+    Sighting,
+)
+from robotd.solver import solve
+from tests.store_surveys import (
+    World,
+    label_of,
+    load,
+    noisy_room,
+    quiet_room,
+    simulate,
+    with_sightings,
+)
+
+
+def test_a_label_seen_from_one_stop_is_unplaced_and_says_what_to_do():
+    survey, _ = quiet_room()
+    once = with_sightings(survey, lambda stop: [s for s in stop.sightings if s.label != "S01" or stop.stop == 1])
+    label = label_of(solve(once), "S01")
+    assert (label.status, label.position, label.covariance) == ("unplaced", None, None)
+    assert label.reason == "seen from one stop only; map it from a second stop"
+    assert label.sightings >= 1
+
+
+def test_nearly_parallel_views_are_not_enough():
+    store = load("room")
+    store["labels"].append({"id": "FAR", "position": [40.0, 0.85, 0.9], "normal": [-1.0, 0.0, 0.0]})
+    store["walls"], store["shelves"] = [], []
+    survey, _ = simulate(store, 1, replace(World(), reach=100.0, reflections=0.0, wrong_ids=0.0))
+    near = with_sightings(survey, lambda stop: [s for s in stop.sightings if s.label != "FAR" or stop.stop in (1, 2)])
+    label = label_of(solve(near), "FAR")
+    assert label.status == "unplaced"
+    assert label.reason.startswith("views nearly parallel")
+
+
+def reflected(survey, truth, name, stops, probability=None, raised=0.0):
+    """Rival sightings of one label: its image in a mirror behind it, from the given stops; `raised` by a tilted one."""
+    x, y, z = truth[name]
+    image = np.array([[x, 2.0 * (y - 0.5) - y, z + raised]])
+
+    def change(stop):
+        sightings = [s for s in stop.sightings if s.label != name or stop.stop in stops]
+        if stop.stop not in stops:
+            return sightings
+        T = pose_matrix(stop.odometry.x, stop.odometry.y, stop.odometry.heading)
+        for model in survey.rig.cameras:
+            camera = Camera(model)
+            uv, valid = camera.project(transform_points(invert_rigid(T @ camera.T_robot_camera), image))
+            if valid[0] and camera.in_image(uv)[0]:
+                sightings.append(Sighting(camera.name, name, float(uv[0, 0]), float(uv[0, 1]), 0.1, probability))
+                break
+        return sightings
+
+    return with_sightings(survey, change)
+
+
+def test_tied_mirror_solutions_are_reported_with_both_candidates():
+    survey, truth = quiet_room()
+    seen = [s.stop for s in survey.stops if sum(g.label == "S04" for g in s.sightings) == 1][:3]
+    label = label_of(solve(reflected(survey, truth, "S04", seen, raised=0.3)), "S04")
+    assert (label.status, label.position) == ("ambiguous", None)
+    assert len(label.candidates) == 2
+    assert min(np.linalg.norm(np.subtract(c.position, truth["S04"])) for c in label.candidates) < 1e-3
+    assert "tied" in label.reason
+
+
+def test_the_probability_of_sightings_breaks_a_tie():
+    survey, truth = quiet_room()
+    seen = [s.stop for s in survey.stops if sum(g.label == "S04" for g in s.sightings) == 1][:3]
+    label = label_of(solve(reflected(survey, truth, "S04", seen, 0.3, raised=0.3)), "S04")
+    assert label.status == "placed"
+    np.testing.assert_allclose(label.position, truth["S04"], atol=1e-4)
+
+
+@pytest.mark.parametrize("direct", [2, 3])
+def test_of_a_label_and_its_image_in_upright_glass_the_nearer_one_is_the_label(direct):
+    survey, truth = quiet_room()
+    both = reflected(survey, truth, "S04", [s.stop for s in survey.stops])
+    seen = [s.stop for s in survey.stops if sum(g.label == "S04" for g in s.sightings) == 1]
+    assert len(seen) > direct
+
+    def mostly_the_image(stop):  # the label itself from a few stops, its image from all
+        mine = [s for s in stop.sightings if s.label == "S04"]
+        hidden = mine[:1] if len(mine) == 2 and stop.stop in seen[direct:] else []
+        return [s for s in stop.sightings if not any(s is h for h in hidden)]
+
+    result = solve(with_sightings(both, mostly_the_image))
+    label = label_of(result, "S04")
+    assert label.status == "placed"
+    np.testing.assert_allclose(label.position, truth["S04"], atol=1e-4)
+    assert sum(s.weight == 0.0 for s in result.sightings if s.label == "S04") > direct
+
+
+def test_a_label_whose_sightings_do_not_meet_is_unplaced():
+    survey, _ = quiet_room()
+    rng = np.random.default_rng(0)
+
+    def scatter(stop):
+        for s in stop.sightings:
+            yield s if s.label != "S05" else replace(s, u=float(rng.uniform(50, 590)), v=float(rng.uniform(300, 400)))
+
+    label = label_of(solve(with_sightings(survey, scatter)), "S05")
+    assert label.status == "unplaced"
+    assert "do not meet in one point" in label.reason
+
+
+def test_two_agreeing_sightings_among_as_many_others_are_not_trusted():
+    survey, _ = quiet_room()
+    rng = np.random.default_rng(3)
+
+    def spoil(stop):
+        for s in stop.sightings:
+            if s.label != "N17" or stop.stop <= 2:
+                yield s
+            elif stop.stop <= 5:
+                yield replace(s, u=float(rng.uniform(50, 590)), v=float(rng.uniform(300, 400)))
+
+    label = label_of(solve(with_sightings(survey, spoil)), "N17")
+    assert label.status == "unplaced"
+    assert "sightings agree, which may be chance" in label.reason
+
+
+def test_every_sighting_is_accounted_for():
+    survey, _ = noisy_room()
+    result = solve(survey)
+    asked = [(stop.leg, stop.stop, s.camera, s.label) for stop in survey.stops for s in stop.sightings]
+    assert [(s.leg, s.stop, s.camera, s.label) for s in result.sightings] == asked
+    assert [label.label for label in result.labels] == sorted({label for *_, label in asked})
+    used = [s for s in result.sightings if s.weight == 1.0]
+    assert len(used) == sum(label.inliers for label in result.labels)
+    assert all(np.hypot(*s.residual_px) < 0.6 for s in used)
+    assert result.rms_px == pytest.approx(np.sqrt(np.mean([np.square(s.residual_px) for s in used])))
+
+
+def test_an_image_is_not_placed_when_one_sighting_puts_the_label_in_front_of_the_glass():
+    survey, truth = quiet_room()
+    both = reflected(survey, truth, "S04", [s.stop for s in survey.stops])
+    first = next(s.stop for s in survey.stops if any(g.label == "S04" for g in s.sightings))
+
+    def the_image_and_one_look(stop):
+        mine = [s for s in stop.sightings if s.label == "S04"]
+        direct = mine[:-1] if stop.stop != first else []  # the image is the last one
+        return [s for s in stop.sightings if not any(s is d for d in direct)]
+
+    label = label_of(solve(with_sightings(both, the_image_and_one_look)), "S04")
+    assert (label.status, label.position) == ("ambiguous", None)
+    assert min(np.linalg.norm(np.subtract(c.position, truth["S04"])) for c in label.candidates) < 0.01
+    assert "image in glass" in label.reason
