@@ -2,87 +2,74 @@
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import dataclass, replace
-from typing import Any
 
 from robotd.bind import ranged
+from robotd.camera_driver import CameraDriver
 from robotd.errors import DriverFault
-from robotd.hardware import CameraMode
-from robotd.plugin import Driver
+from robotd.hardware import CameraMode, CameraSource
 
 
 @dataclass(frozen=True, slots=True)
 class V4l2Config:
     """[drivers.<camera>] with driver = "v4l2"
 
-    `device` is best one of /dev/v4l/by-path/, because those names survive replugging; `fps`, where given, replaces the
-    frame rate that is asked for, e.g. where four cameras share one USB bus.
+    `device` is best one of /dev/v4l/by-path/, because those names survive replugging. What is given here replaces what
+    is asked for: `fps`, e.g. where four cameras share one USB bus, and `gain` in the camera's own units.
     """
 
     device: str
     fps: float | None = ranged(None, minimum=1.0, maximum=1000.0)
+    gain: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.device:
+            raise ValueError("device: found ''; expected a file such as /dev/v4l/by-path/..., see ls /dev/v4l/by-path")
 
 
-class V4l2Driver(Driver):
+class V4l2Driver(CameraDriver):
     """Publishes the frames of one camera while it is started."""
 
-    kind = "camera"
     Config = V4l2Config
     config: V4l2Config
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._mode: CameraMode | None = None  # what is wanted; None: nothing
-        self._changed = asyncio.Event()
-
     async def open(self) -> None:
         """See that the camera is there and gives itself to us."""
-        source = await self.hardware.open_camera(self.config.device, self.name, self._asked(self._mode or CameraMode()))
+        source = await self._open_source(self._mode or CameraMode())
         source.close()
 
-    async def start(self, mode: CameraMode) -> None:
-        """Stream in this mode."""
-        self._want(mode)
-
-    async def stop(self) -> None:
-        """Stop streaming."""
-        self._want(None)
-
-    async def run(self) -> None:
-        """Stream whenever started; raises DriverFault when the camera fails."""
-        while True:
-            self._changed.clear()
-            if self._mode is not None:
-                await self._stream(self._mode)
-            else:
-                await self._changed.wait()
-
-    def _want(self, mode: CameraMode | None) -> None:
-        self._mode = mode
-        self._changed.set()
-
-    def _asked(self, mode: CameraMode) -> CameraMode:
-        return mode if self.config.fps is None else replace(mode, fps=self.config.fps)
-
     async def _stream(self, mode: CameraMode) -> None:
-        """Publish frames until another mode is wanted."""
-        asked = self._asked(mode)
-        source = await self.hardware.open_camera(self.config.device, self.name, asked)
+        source = await self._open_source(mode)
         try:
-            if source.mode.size != asked.size:
-                wanted, given = (f"{width}x{height}" for width, height in (asked.size, source.mode.size))
-                raise DriverFault(
-                    f"{self.config.device} gives {given} pixels instead of {wanted}, which it was calibrated for; "
-                    "connect the camera that the calibration belongs to, or calibrate this one"
-                )
-            if abs(source.mode.fps / asked.fps - 1) > 0.01:
-                text = f"{self.config.device} gives {source.mode.fps:g} frames a second instead of {asked.fps:g}"
-                self.report(text, "warning")
-            topic = self.bus.frames(self.name)
-            while self._mode == mode:
-                frame = await source.read()
-                if self._mode == mode:  # nothing of an old mode is seen once another one was asked for
-                    topic.publish(frame)
+            self._check_mode(source, self._asked(mode))
+            self._begin(source.counts, source.mode.fps)
+            while True:
+                self._publish(await source.read(), mode)
         finally:
             source.close()
+
+    async def _open_source(self, mode: CameraMode) -> CameraSource:
+        return await self.hardware.open_camera(self.config.device, self.name, self._asked(mode))
+
+    def _asked(self, mode: CameraMode) -> CameraMode:
+        config = self.config
+        return replace(
+            mode,
+            fps=mode.fps if config.fps is None else config.fps,
+            gain=mode.gain if config.gain is None else config.gain,
+        )
+
+    def _check_mode(self, source: CameraSource, asked: CameraMode) -> None:
+        """Say what the camera does not do as asked; another size is a fault."""
+        given = source.mode
+        if given.size != asked.size:
+            texts = (f"{width}x{height}" for width, height in (given.size, asked.size))
+            raise DriverFault(
+                "{} gives {} pixels instead of {}, which it was calibrated for; ".format(self.config.device, *texts)
+                + "connect the camera that the calibration belongs to, or calibrate this one"
+            )
+        remarks = list(source.remarks)
+        if not remarks and abs(given.fps / asked.fps - 1) > 0.01:
+            remarks.append(f"gives {given.fps:g} frames a second instead of {asked.fps:g}")
+        for remark in remarks:
+            self.report(f"{self.config.device} {remark}", "warning")

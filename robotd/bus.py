@@ -8,7 +8,18 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from typing import Generic, TypeVar
 
-from .records import DriveCommand, Event, Frame, MissionStatus, OdometryState, SensorFrame
+from .records import (
+    DriveCommand,
+    Event,
+    Frame,
+    LineMotion,
+    LinePoints,
+    LineStatus,
+    MissionStatus,
+    OdometryState,
+    SensorFrame,
+    Withdrawal,
+)
 
 T = TypeVar("T")
 
@@ -16,11 +27,17 @@ T = TypeVar("T")
 class Subscription(Generic[T]):
     """A bounded queue of what a topic published since; when it is full the oldest item is dropped and counted."""
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, taken: asyncio.Event | None = None) -> None:
         self._items: deque[T] = deque()
         self._size = size
         self._wake = asyncio.Event()
+        self._taken = taken or asyncio.Event()
         self.dropped = 0
+
+    @property
+    def waiting(self) -> int:
+        """How many items have not been taken."""
+        return len(self._items)
 
     def put(self, item: T) -> None:
         if len(self._items) >= self._size:
@@ -34,6 +51,11 @@ class Subscription(Generic[T]):
         while not self._items:
             self._wake.clear()
             await self._wake.wait()
+        return self.take()
+
+    def take(self) -> T:
+        """The next item; there must be one `waiting`."""
+        self._taken.set()
         return self._items.popleft()
 
     async def __aiter__(self) -> AsyncIterator[T]:
@@ -47,6 +69,7 @@ class Topic(Generic[T]):
     def __init__(self) -> None:
         self.latest: T | None = None
         self._subscriptions: list[Subscription[T]] = []
+        self._taken = asyncio.Event()  # somebody took something, came or went
 
     def publish(self, item: T) -> None:
         self.latest = item
@@ -56,12 +79,20 @@ class Topic(Generic[T]):
     @contextmanager
     def subscribe(self, size: int = 64) -> Iterator[Subscription[T]]:
         """Receive what is published inside the block; at most `size` items wait."""
-        subscription: Subscription[T] = Subscription(size)
+        subscription: Subscription[T] = Subscription(size, self._taken)
         self._subscriptions.append(subscription)
+        self._taken.set()
         try:
             yield subscription
         finally:
             self._subscriptions.remove(subscription)
+            self._taken.set()
+
+    async def wait_taken(self) -> None:
+        """Until there is a subscriber and every one has taken all that was published: nothing is dropped after it."""
+        while not self._subscriptions or any(subscription.waiting for subscription in self._subscriptions):
+            self._taken.clear()
+            await self._taken.wait()
 
 
 class Bus:
@@ -71,8 +102,12 @@ class Bus:
         self.sensors: Topic[SensorFrame] = Topic()  # from the base driver, 66.7 Hz
         self.odometry: Topic[OdometryState] = Topic()  # from the daemon, one for each sensor frame
         self.commands: Topic[DriveCommand] = Topic()  # from followers and operators, to the safety layer
+        self.withdrawals: Topic[Withdrawal] = Topic()  # the same ones taking it back
         self.events: Topic[Event] = Topic()  # for the operator and the journal
         self.status: Topic[MissionStatus] = Topic()  # from the mission, at every change
+        self.line_status: Topic[LineStatus] = Topic()  # from the follower
+        self.line_motion: Topic[LineMotion] = Topic()  # the same, measured by the line alone
+        self.line_points: Topic[LinePoints] = Topic()  # the same: the line as it leaves the robot's memory
         self._frames: dict[str, Topic[Frame]] = {}
 
     def frames(self, camera: str) -> Topic[Frame]:

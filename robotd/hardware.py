@@ -6,6 +6,7 @@ Drivers get everything they touch from a `Hardware`. `RealHardware` opens device
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Protocol
@@ -34,17 +35,34 @@ class SerialLink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CameraMode:
-    """What a camera is asked for: size in pixels (width, height), frames per second, exposure in seconds."""
+    """What a camera is asked for: size in pixels (width, height), frames per second, exposure in seconds.
+
+    `gain` is in the camera's own units; None: its default.
+    """
 
     size: tuple[int, int] = (640, 480)
     fps: float = 30.0
     exposure: float = 0.010
+    gain: float | None = None
+
+
+@dataclass(slots=True)
+class CameraCounts:
+    """What became of a camera's frames since it was opened; `decode_s` is the sum over those that were decoded."""
+
+    decoded: int = 0
+    decode_s: float = 0.0
+    damaged: int = 0  # arrived, but not as a whole image of the right size
+    lost: int = 0  # never arrived
+    dropped: int = 0  # were replaced by newer ones before anybody took them
 
 
 class CameraSource(Protocol):
     """An open, running camera. Every method raises DriverFault when the device is gone."""
 
     mode: CameraMode  # as negotiated, which may differ from what was asked for
+    remarks: tuple[str, ...]  # in words, what the camera does not do as it was asked
+    counts: CameraCounts
 
     async def read(self) -> Frame:
         """Wait for the next frame; when nobody reads, the oldest waiting ones are dropped."""
@@ -53,12 +71,29 @@ class CameraSource(Protocol):
         """Stop streaming and release the device; safe to call twice."""
 
 
+class Ticker(Protocol):
+    """Calls a function at even times until it is closed."""
+
+    async def wait(self) -> None:
+        """Until the function failed: raises what it raised."""
+
+    def close(self) -> None:
+        """No call begins after this; safe to call twice."""
+
+
 class Hardware(Protocol):
     """Where drivers get their devices from."""
 
     @property
     def pins(self) -> Any:
-        """A gpiozero pin factory, or None for gpiozero's default."""
+        """A gpiozero pin factory; raises DriverFault where there are no pins."""
+
+    def ticker(self, period: float, function: Callable[[int], None]) -> Ticker:
+        """Call function(k) at start + k * period for k = 0, 1, ...: absolute deadlines, so there is no drift.
+
+        What is late by whole periods is left out, and the number says so. The function may be called in another
+        thread, because the loop can be busy: it must be short and touch nothing but its pins.
+        """
 
     async def open_serial(self, port: str, baud: int) -> SerialLink:
         """Open a serial port exclusively; raises DriverFault with the reason and the mend."""

@@ -58,16 +58,41 @@ class SensorFrame:
     overcurrent: bool = False
     voltage: float | None = None
     charge_fraction: float | None = None
+    slipping: bool = False  # wheels and floor disagree: odometry is worse than usual
+    docked: bool = False
+    charging: bool = False
+    resets: int = 0  # how often the wheel travel was interrupted: across a change unknown motion is missing
+
+
+OPERATOR = "operator"  # the source whose wishes to move beat those of all others
 
 
 @dataclass(frozen=True, slots=True)
 class DriveCommand:
-    """A wish to move: `speed` in m/s forward, `turn_rate` in rad/s counter-clockwise; valid for 0.2 s from `t`."""
+    """A wish to move: `speed` in m/s forward, `turn_rate` in rad/s counter-clockwise; valid for 0.2 s from `t`.
+
+    `source` is the instance's name of a driver, or OPERATOR for a person.
+    `line_t` is when the line that it follows was last seen (the stamp of that frame); None if it follows no line.
+    """
 
     t: float
     speed: float
     turn_rate: float
     source: str
+    line_t: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Withdrawal:
+    """A source takes back its wishes to move up to `t` and says why: "line lost: ...", "the connection is gone".
+
+    Its next wish to move counts again. `source` None is an operator's stop: it takes back everybody's wishes, and
+    none counts until the operator asks for motion anew or resumes the mission.
+    """
+
+    t: float
+    source: str | None
+    cause: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,14 +172,102 @@ class Flash:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Line:
-    """A line in the top view: `points` (N, 2) u, v in pixels ordered along it, `width` in pixels, confidence 0..1."""
+    """A line in the top view.
+
+    Attributes
+    ----------
+    points : (N, 2) array
+        u, v in pixels of the centre, ordered along the line, sub-pixel.
+    width : float
+        Pixels.
+    confidence : float
+        0..1.
+    normals : (N, 2) array, optional
+        Unit normals at the points: the tangent (along the points) turned by +90 degrees from u towards v.
+    curvature : (N,) array, optional
+        Radians per pixel, positive where the line turns from u towards v, fitted over three widths.
+    polarity : "dark" or "bright", optional
+        Of the line against the floor.
+    closed : bool
+        It comes back to its start.
+    """
 
     points: Floats
     width: float
     confidence: float
+    normals: Floats | None = None
+    curvature: Floats | None = None
+    polarity: Literal["dark", "bright"] | None = None
+    closed: bool = False
+
+    def __post_init__(self) -> None:
+        for array in (self.points, self.normals, self.curvature):
+            if array is not None:
+                array.flags.writeable = False
+
+
+LineState = Literal[
+    "standing",  # nobody asks to follow
+    "acquiring",  # no line yet
+    "tracking",  # seen in the last frame
+    "predicting",  # not seen in the last frame, or not in view at present: driving on what is remembered
+    "searching near",  # found again by a search with relaxed limits around the prediction
+    "searching all",  # found again by one of the whole view
+    "coasting",  # nothing found: slowly on, what is remembered is wrong or covered
+    "turning",  # on the spot, to the side on which the line was last
+    "ended",  # its end was seen, and the robot stops there
+    "lost",  # given up
+]
+
+
+@dataclass(frozen=True, slots=True)
+class LineStatus:
+    """How the follower is getting on, at every frame and every change of state.
+
+    `confidence` 0..1 that what is followed is the line; `offset` metres of the robot to the left of the path,
+    `heading_error` its heading against the path's; `unseen` metres driven since the line should have been seen.
+    """
+
+    t: float
+    source: str
+    state: LineState
+    confidence: float
+    offset: float = 0.0
+    heading_error: float = 0.0
+    unseen: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LineMotion:
+    """Motion between two frames as the line alone shows it, in robot axes at `t0`; odometry has no part in it.
+
+    `information` is the inverse of the covariance of (dx, dy, dheading). Along a direction that the line does not
+    show, e.g. that of a straight line, it is zero (the variance is infinite) and the motion given there means nothing.
+    """
+
+    t0: float
+    t1: float
+    dx: float
+    dy: float
+    dheading: float
+    information: Matrix3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinePoints:
+    """Pieces of the line that are finished, because they lie behind the robot.
+
+    `points` (N, 2) metres in odometry axes; `travelled` (N,) metres driven when the robot was abreast of them.
+    """
+
+    t: float
+    source: str
+    points: Floats
+    travelled: Floats
 
     def __post_init__(self) -> None:
         self.points.flags.writeable = False
+        self.travelled.flags.writeable = False
 
 
 # ---- survey: what the robot brings home (robotd-survey/1) ------------------------------------------------------------
