@@ -1,9 +1,23 @@
-"""Kernels of robotd.vision.stroke: thin edges, strokes between opposite edges, and tracing along stroke centres.
+"""Kernels of robotd.vision.stroke: thin edges, and strokes between opposite edges.
 
 Their plain versions are in robotd/vision/stroke_reference.py, which also says what each one computes.
 """
 
-from libc.math cimport fabsf, floorf, sqrtf
+from libc.math cimport fabsf, sqrtf
+from libc.string cimport memcpy, memset
+
+
+cdef inline int _sector(float x, float y) noexcept nogil:
+    """Which of 16 equal sectors a direction lies in, counted from the one after +u towards +v."""
+    cdef float wide = fabsf(x), high = fabsf(y)
+    cdef int part
+    if high <= wide:
+        part = 0 if high < 0.41421356 * wide else 1
+    else:
+        part = 2 if wide > 0.41421356 * high else 3
+    if x >= 0.0:
+        return part if y >= 0.0 else 15 - part
+    return 7 - part if y >= 0.0 else 8 + part
 
 
 def edges(
@@ -13,70 +27,116 @@ def edges(
     float factor,
     float low,
     float high,
-    float[:, ::1] magnitude,
     int[:, ::1] index,
+    unsigned char[:, ::1] sector,
     float[:, ::1] out,
 ):
-    cdef Py_ssize_t height = gx.shape[0], width = gx.shape[1], row, col, capacity = out.shape[0]
-    cdef double total = 0.0
-    cdef float row_sum, level, here, before, after, bend
-    cdef int inside = 0, found = 0, row_inside
-    cdef bint across
+    cdef Py_ssize_t height = gx.shape[0], width = gx.shape[1], row, col, at, side, capacity = out.shape[0]
+    cdef unsigned long long eight
+    cdef short bound, larger
+    cdef const short *x
+    cdef const short *y
+    cdef const unsigned char *inside
+    cdef int *place
+    cdef unsigned char *code
+    cdef int found = 0, row_sum, row_inside, square, here, least
+    cdef long long total = 0, pixels = 0
+    cdef float level, middle, before, after, bend
+    cdef bint across, masked = valid.shape[0] > 0
     with nogil:
-        for row in range(height):
-            row_sum = 0.0
+        for row in range(0, height, 2):  # because every other row says enough
+            x, y = &gx[row, 0], &gy[row, 0]
+            row_sum = 0
             row_inside = 0
-            for col in range(width):
-                magnitude[row, col] = sqrtf(
-                    <float> (<int> gx[row, col] * gx[row, col] + <int> gy[row, col] * gy[row, col])
-                ) * <float> valid[row, col]
-                row_sum += magnitude[row, col]
-                row_inside += valid[row, col]
-                index[row, col] = -1
+            if masked:
+                inside = &valid[row, 0]
+                for col in range(width):
+                    row_sum += inside[col] * ((x[col] if x[col] > 0 else -x[col]) + (y[col] if y[col] > 0 else -y[col]))
+                    row_inside += inside[col]
+            else:
+                for col in range(width):
+                    row_sum += (x[col] if x[col] > 0 else -x[col]) + (y[col] if y[col] > 0 else -y[col])
+                row_inside = <int> width
             total += row_sum
-            inside += row_inside
-        level = factor * <float> (total / (inside if inside > 0 else 1))
+            pixels += row_inside
+        # the mean over all directions of |cos| + |sin| is 4 / pi
+        level = factor * 0.7853982 * <float> (<double> total / <double> (pixels if pixels > 0 else 1))
         level = low if level < low else (high if level > high else level)
+        least = <int> (level * level)
+        bound = <short> (0.7071 * level)  # what the larger component of so long a gradient exceeds
+        for row in range(height):
+            x, y, code = &gx[row, 0], &gy[row, 0], &sector[row, 0]
+            if row == 0 or row == height - 1:
+                memset(code, 0, width)
+                continue
+            for col in range(width):  # apart from what follows, because so the compiler makes it wide
+                larger = x[col] if x[col] > <short> -x[col] else <short> -x[col]
+                larger = y[col] if y[col] > larger else larger
+                larger = <short> -y[col] if <short> -y[col] > larger else larger
+                code[col] = larger > bound
+            code[0] = code[width - 1] = 0
         for row in range(1, height - 1):
-            for col in range(1, width - 1):
-                here = magnitude[row, col]
-                if here < level or found >= capacity:
+            x, y, place, code = &gx[row, 0], &gy[row, 0], &index[row, 0], &sector[row, 0]
+            col = 0
+            while col < width:
+                if col + 8 <= width:
+                    memcpy(&eight, code + col, 8)
+                    if eight == 0:
+                        col += 8
+                        continue
+                if code[col] == 0:
+                    col += 1
                     continue
-                across = gx[row, col] * gx[row, col] >= gy[row, col] * gy[row, col]
-                if across:
-                    before, after = magnitude[row, col - 1], magnitude[row, col + 1]
-                else:
-                    before, after = magnitude[row - 1, col], magnitude[row + 1, col]
-                if before == 0.0 or after == 0.0 or here < before or here <= after:
+                code[col] = 0
+                col += 1
+                at = col - 1
+                here = x[at] * x[at] + y[at] * y[at]
+                if here <= least:
                     continue
-                bend = before - 2.0 * here + after
-                bend = 0.5 * (before - after) / bend
-                out[found, 0] = <float> col + (bend if across else <float> 0.0)
+                across = x[at] * x[at] >= y[at] * y[at]
+                side = 1 if across else width
+                square = x[at - side] * x[at - side] + y[at - side] * y[at - side]
+                if square > here:
+                    continue
+                before = <float> square
+                square = x[at + side] * x[at + side] + y[at + side] * y[at + side]
+                if square >= here:
+                    continue
+                after = <float> square
+                if masked:
+                    inside = &valid[row, 0]
+                    if inside[at] == 0 or inside[at - side] == 0 or inside[at + side] == 0:
+                        continue
+                if found >= capacity:
+                    continue
+                middle, before, after = sqrtf(<float> here), sqrtf(before), sqrtf(after)
+                bend = 0.5 * (before - after) / (before - 2.0 * middle + after)
+                out[found, 0] = <float> at + (bend if across else <float> 0.0)
                 out[found, 1] = <float> row + (<float> 0.0 if across else bend)
-                out[found, 2] = <float> gx[row, col] / here
-                out[found, 3] = <float> gy[row, col] / here
-                out[found, 4] = here
-                index[row, col] = found
+                out[found, 2] = <float> x[at] / middle
+                out[found, 3] = <float> y[at] / middle
+                out[found, 4] = middle
+                place[at] = found
+                code[at] = <unsigned char> (1 + _sector(<float> x[at], <float> y[at]))
                 found += 1
     return found, level
 
 
 cdef inline int _opposite(
-    const float[:, ::1] edge, const int[:, ::1] index, int i, Py_ssize_t row, Py_ssize_t col,
-    float low, float high, float sign, float parallel,
+    const float *edge, const int *index, int i, Py_ssize_t at, float low, float high, float sign, float parallel,
 ) noexcept nogil:
     """The edge at a pixel if it is a partner of edge i, else -1."""
-    cdef int j
-    cdef float mu, mv, norm, across
-    if row < 0 or col < 0 or row >= index.shape[0] or col >= index.shape[1]:
+    cdef int j = index[at]
+    cdef const float *one = edge + 5 * i
+    cdef const float *two
+    cdef float mu, mv, across
+    if j < 0:
         return -1
-    j = index[row, col]
-    if j < 0 or edge[i, 2] * edge[j, 2] + edge[i, 3] * edge[j, 3] > -parallel:
+    two = edge + 5 * j
+    if one[2] * two[2] + one[3] * two[3] > -parallel:
         return -1
-    mu = edge[i, 2] - edge[j, 2]
-    mv = edge[i, 3] - edge[j, 3]
-    norm = sqrtf(mu * mu + mv * mv)
-    across = sign * ((edge[j, 0] - edge[i, 0]) * mu + (edge[j, 1] - edge[i, 1]) * mv) / norm
+    mu, mv = one[2] - two[2], one[3] - two[3]
+    across = sign * ((two[0] - one[0]) * mu + (two[1] - one[1]) * mv) / sqrtf(mu * mu + mv * mv)
     return j if low <= across <= high else -1
 
 
@@ -84,6 +144,7 @@ def strokes(
     const float[:, ::1] edge,
     int count,
     const int[:, ::1] index,
+    const unsigned char[:, ::1] sector,
     float low,
     float high,
     float sign,
@@ -92,40 +153,56 @@ def strokes(
     int[::1] partner,
     float[:, ::1] out,
 ):
-    cdef Py_ssize_t height = index.shape[0], width = index.shape[1], row, col, capacity = out.shape[0]
-    cdef int i, j, k, step, first, last, found = 0, hit
-    cdef float du, dv, major, u, v, mu, mv, norm, across, gap
+    cdef Py_ssize_t height = index.shape[0], width = index.shape[1], row, col, at, side, capacity = out.shape[0]
+    cdef int i, j, k, step, first, last, found = 0, hit, fixed_u, fixed_v, step_u, step_v
+    cdef float du, dv, major, mu, mv, norm, across, gap
     cdef bint horizontal
+    cdef const float *all = &edge[0, 0]
+    cdef const float *one
+    cdef const float *two
+    cdef const float *three
+    cdef const int *pixel = &index[0, 0]
+    cdef const unsigned char *code = &sector[0, 0]
+    cdef unsigned int wanted  # bit 1 + s is set if an edge in sector s can be opposite
+    cdef int[16] near
+    cdef int sides = 2  # sectors that an opposite direction can be off: 22.5 degrees each, and one for their width
+    for i in range(16):
+        near[i] = 0
+        for j in range(-sides, sides + 1):
+            near[i] |= 1 << (1 + (i + 8 + j + 16) % 16)
     with nogil:
         for i in range(count):
             partner[i] = -1
-            du = sign * edge[i, 2]
-            dv = sign * edge[i, 3]
+            one = all + 5 * i
+            du, dv = sign * one[2], sign * one[3]
             horizontal = fabsf(du) >= fabsf(dv)
             major = fabsf(du) if horizontal else fabsf(dv)
             du /= major
             dv /= major
+            side = width if horizontal else 1
+            wanted = near[_sector(one[2], one[3])]
             first = <int> (low * major) - 1
             first = 1 if first < 1 else first
             last = <int> (high * major) + 2
+            # 16 bits of fraction, because rounding floats is slower than shifting
+            step_u, step_v = <int> (du * 65536.0), <int> (dv * 65536.0)
+            fixed_u = <int> ((one[0] + 0.5) * 65536.0) + first * step_u
+            fixed_v = <int> ((one[1] + 0.5) * 65536.0) + first * step_v
             for step in range(first, last):
-                u = edge[i, 0] + du * <float> step
-                v = edge[i, 1] + dv * <float> step
-                col = <Py_ssize_t> floorf(u + 0.5)
-                row = <Py_ssize_t> floorf(v + 0.5)
-                if col < 0 or row < 0 or col >= width or row >= height:
+                col, row = fixed_u >> 16, fixed_v >> 16
+                fixed_u += step_u
+                fixed_v += step_v
+                # edges never lie in the outermost pixels, so these need no look-up, nor do their outer neighbours
+                if col < 1 or row < 1 or col >= width - 1 or row >= height - 1:
                     break
-                hit = _opposite(edge, index, i, row, col, low, high, sign, parallel)
-                if hit < 0:
-                    hit = _opposite(
-                        edge, index, i, row + (1 if horizontal else 0), col + (0 if horizontal else 1),
-                        low, high, sign, parallel,
-                    )
-                if hit < 0:
-                    hit = _opposite(
-                        edge, index, i, row - (1 if horizontal else 0), col - (0 if horizontal else 1),
-                        low, high, sign, parallel,
-                    )
+                at = row * width + col
+                hit = -1
+                if wanted >> code[at] & 1:
+                    hit = _opposite(all, pixel, i, at, low, high, sign, parallel)
+                if hit < 0 and wanted >> code[at + side] & 1:
+                    hit = _opposite(all, pixel, i, at + side, low, high, sign, parallel)
+                if hit < 0 and wanted >> code[at - side] & 1:
+                    hit = _opposite(all, pixel, i, at - side, low, high, sign, parallel)
                 if hit >= 0:
                     partner[i] = hit
                     break
@@ -134,166 +211,22 @@ def strokes(
             if j < 0 or found >= capacity:
                 continue
             k = partner[j]
-            if k < 0:
+            if k < 0 or (k == i and j < i):
                 continue
-            mu = edge[i, 2] - edge[j, 2]
-            mv = edge[i, 3] - edge[j, 3]
+            one, two, three = all + 5 * i, all + 5 * j, all + 5 * k
+            mu, mv = one[2] - two[2], one[3] - two[3]
             norm = sqrtf(mu * mu + mv * mv)
             mu /= norm
             mv /= norm
-            across = sign * ((edge[j, 0] - edge[i, 0]) * mu + (edge[j, 1] - edge[i, 1]) * mv)
-            gap = (edge[k, 0] - edge[i, 0]) * (edge[k, 0] - edge[i, 0]) \
-                + (edge[k, 1] - edge[i, 1]) * (edge[k, 1] - edge[i, 1])
+            across = sign * ((two[0] - one[0]) * mu + (two[1] - one[1]) * mv)
+            gap = (three[0] - one[0]) * (three[0] - one[0]) + (three[1] - one[1]) * (three[1] - one[1])
             if gap > 4.0 and gap > mutual * mutual * across * across:
                 continue
-            out[found, 0] = 0.5 * (edge[i, 0] + edge[j, 0])
-            out[found, 1] = 0.5 * (edge[i, 1] + edge[j, 1])
+            out[found, 0] = 0.5 * (one[0] + two[0])
+            out[found, 1] = 0.5 * (one[1] + two[1])
             out[found, 2] = -mv
             out[found, 3] = mu
             out[found, 4] = across
-            out[found, 5] = edge[i, 4] if edge[i, 4] < edge[j, 4] else edge[j, 4]
+            out[found, 5] = one[4] if one[4] < two[4] else two[4]
             found += 1
     return found
-
-
-cdef int _window(
-    const float[:, ::1] stroke, const unsigned char[::1] state, float u, float v, float du, float dv,
-    float half, float radius, float aligned, float* mean,
-) noexcept nogil:
-    """Sums over the strokes round (u, v): mean = along, across, tangent u, tangent v, claimed; returns how many."""
-    cdef Py_ssize_t i
-    cdef int count = 0
-    cdef float ru, rv, along, across, turn
-    for i in range(5):
-        mean[i] = 0.0
-    for i in range(stroke.shape[0]):
-        if state[i] == 0:
-            continue
-        ru = stroke[i, 0] - u
-        rv = stroke[i, 1] - v
-        along = ru * du + rv * dv
-        if fabsf(along) > half:
-            continue
-        across = rv * du - ru * dv
-        if fabsf(across) > radius:
-            continue
-        turn = stroke[i, 2] * du + stroke[i, 3] * dv
-        if fabsf(turn) < aligned:
-            continue
-        count += 1
-        mean[0] += along
-        mean[1] += across
-        mean[2] += stroke[i, 2] if turn > 0.0 else -stroke[i, 2]
-        mean[3] += stroke[i, 3] if turn > 0.0 else -stroke[i, 3]
-        mean[4] += 1.0 if state[i] == 2 else 0.0
-    if count > 0:
-        mean[0] /= count
-        mean[1] /= count
-        mean[4] /= count
-    return count
-
-
-def trace(
-    const float[:, ::1] stroke,
-    const unsigned char[::1] state,
-    float u,
-    float v,
-    float du,
-    float dv,
-    float step,
-    float radius,
-    float gap,
-    int least,
-    float aligned,
-    float[:, ::1] out,
-):
-    cdef int found = 0, count, jump, jumps = <int> (gap / step), filled = 0, travelled = 0
-    cdef float start_u = u, start_v = v, start_du = du, start_dv = dv, norm, qu, qv, furthest, along, across, tu, tv
-    cdef float mean[5]
-    cdef Py_ssize_t i, capacity = out.shape[0]
-    cdef bint closed = False
-    with nogil:
-        while found < capacity - 1:
-            for jump in range(1, jumps + 2):
-                qu = u + du * step * jump
-                qv = v + dv * step * jump
-                count = _window(
-                    stroke, state, qu, qv, du, dv, step, radius * (1.0 + 0.25 * (jump - 1)), aligned, mean
-                )
-                if count >= least and mean[0] > -0.75 * step and not (jump > 1 and mean[4] > 0.5):
-                    break
-            else:
-                break
-            if mean[4] > 0.6:
-                break
-            tu, tv = mean[2], mean[3]
-            norm = sqrtf(tu * tu + tv * tv)
-            u = qu + mean[0] * du - mean[1] * dv
-            v = qv + mean[0] * dv + mean[1] * du
-            du, dv = tu / norm, tv / norm
-            out[found, 0] = u
-            out[found, 1] = v
-            found += 1
-            filled += 1
-            travelled += jump
-            if (
-                travelled > 6
-                and (u - start_u) * (u - start_u) + (v - start_v) * (v - start_v) < step * step
-                and du * start_du + dv * start_dv > aligned
-            ):
-                closed = True
-                break
-        if not closed:
-            furthest = 0.0
-            for i in range(stroke.shape[0]):
-                if state[i] != 1:
-                    continue
-                along = (stroke[i, 0] - u) * du + (stroke[i, 1] - v) * dv
-                across = (stroke[i, 1] - v) * du - (stroke[i, 0] - u) * dv
-                if (
-                    furthest < along <= 1.5 * step
-                    and fabsf(across) <= radius
-                    and fabsf(stroke[i, 2] * du + stroke[i, 3] * dv) >= aligned
-                ):
-                    furthest = along
-            if furthest > 0.0:
-                out[found, 0] = u + furthest * du
-                out[found, 1] = v + furthest * dv
-                found += 1
-    return found, filled, travelled, closed
-
-
-def claim(
-    const float[:, ::1] stroke,
-    unsigned char[::1] state,
-    const float[:, ::1] points,
-    float radius,
-    float aligned,
-):
-    cdef Py_ssize_t i, k, last = points.shape[0] - 1
-    cdef float du, dv, length, ru, rv, along, across
-    cdef int count = 0
-    with nogil:
-        for k in range(last):
-            du = points[k + 1, 0] - points[k, 0]
-            dv = points[k + 1, 1] - points[k, 1]
-            length = sqrtf(du * du + dv * dv)
-            if length <= 0.0:
-                continue
-            du /= length
-            dv /= length
-            for i in range(stroke.shape[0]):
-                if state[i] != 1:
-                    continue
-                ru = stroke[i, 0] - points[k, 0]
-                rv = stroke[i, 1] - points[k, 1]
-                along = ru * du + rv * dv
-                across = rv * du - ru * dv
-                if (
-                    -radius <= along <= length + radius
-                    and fabsf(across) <= radius
-                    and fabsf(stroke[i, 2] * du + stroke[i, 3] * dv) >= aligned
-                ):
-                    state[i] = 2
-                    count += 1
-    return count

@@ -1,4 +1,4 @@
-"""`robotd-solver`: solve and judge surveys in files, and serve robots.
+"""`robotd-solver`: solve and judge surveys in files, calibrate the floor camera, and serve robots.
 
 Exit codes: 0 done, 1 it could not be done, 2 the command or a file is wrong.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import os
 import sys
 from collections import Counter
@@ -88,7 +89,87 @@ def _parser() -> argparse.ArgumentParser:
     )
     serve.add_argument("--token-file", type=Path, metavar="FILE", help="the secret that robots must send")
     serve.set_defaults(run=_serve)
+    _add_calibrate(commands)
     return parser
+
+
+def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    kinds = commands.add_parser("calibrate", help="compute a calibration from pictures").add_subparsers(
+        dest="what", required=True, metavar="WHAT"
+    )
+    floor = kinds.add_parser(
+        "floor",
+        help="where the floor camera sits and looks, from chessboards on the floor",
+        description="Lay a chessboard flat on the floor in view of the floor camera, once or more often, and measure"
+        " where its middle lies at least once. The first --at belongs to the first IMAGE, and so on.",
+    )
+    floor.add_argument("images", nargs="+", type=Path, metavar="IMAGE", help="pictures with the board on the floor")
+    floor.add_argument("--board", type=_board, required=True, metavar="COLSxROWS", help="inner corners, such as 9x6")
+    floor.add_argument("--square", type=_metres, required=True, metavar="M", help="side of a square in metres")
+    floor.add_argument(
+        "--at",
+        action="append",
+        type=_place,
+        required=True,
+        metavar="X,Y,DEGREES",
+        help="middle of the board's inner corners from the robot's centre in metres, x ahead, y to the left; and where"
+        " its long side points: 0 along x, 90 along y",
+    )
+    floor.add_argument("--at-sigma", type=_metres, default=0.003, metavar="M", help="how sure --at is (default: 0.003)")
+    floor.add_argument(
+        "--held",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="IMAGE",
+        help="pictures of the board held at many tilts: the lens",
+    )
+    floor.add_argument(
+        "--calibration",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="gets [floor_camera]; the lens in it is used unless --held is given; all else in it stays",
+    )
+    floor.add_argument("--picture", type=Path, metavar="PNG", help="also draw the corners' residuals and the top view")
+    floor.add_argument("--json", action="store_true", help="print one JSON object")
+    floor.set_defaults(run=_calibrate_floor)
+
+
+def _board(text: str) -> tuple[int, int]:
+    parts = text.split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 3 <= int(part) <= 50 for part in parts):
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected inner corners as COLUMNSxROWS, such as 9x6")
+    columns, rows = sorted((int(part) for part in parts), reverse=True)
+    if columns == rows:
+        raise argparse.ArgumentTypeError(f"found {text!r}; a square board looks the same all four ways round")
+    return columns, rows
+
+
+def _metres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= 1.0:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected metres, above 0 and at most 1, such as 0.025")
+    return value
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, degrees = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = degrees = math.nan
+    if not (math.hypot(x, y) < 10.0 and abs(degrees) <= 360.0):
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected X,Y,DEGREES in metres, such as 0.55,0,90")
+    return x, y, math.radians(degrees)
+
+
+def _calibrate_floor(arguments: argparse.Namespace) -> int:
+    from .floor_tool import run
+
+    return run(arguments)
 
 
 def _port(text: str) -> int:

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robotd.vision.cluster import dbscan, dbscan_reference
+from robotd.vision import _cluster, cluster_reference
+from robotd.vision.cluster import dbscan
 
 
 def points(count, seed, *, columns=5, spread=12.0):
@@ -19,7 +20,7 @@ def points(count, seed, *, columns=5, spread=12.0):
 def test_labels_are_those_of_the_plain_version(count, seed, eps, least, columns):
     features = points(count, seed, columns=columns)
     labels, counts = dbscan(features, eps, least)
-    expected, expected_counts = dbscan_reference(features, eps, least)
+    expected, expected_counts = cluster_reference.dbscan(features, eps, least)
     np.testing.assert_array_equal(labels, expected)
     np.testing.assert_array_equal(counts, expected_counts)
 
@@ -44,13 +45,13 @@ def test_a_border_point_goes_to_the_lower_cluster():
 def test_points_on_a_lattice_of_exactly_eps_are_neighbours():
     lattice = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), axis=-1).reshape(-1, 2)
     labels, counts = dbscan(lattice, 1.0, 3)
-    np.testing.assert_array_equal(counts, dbscan_reference(lattice, 1.0, 3)[1])
+    np.testing.assert_array_equal(counts, cluster_reference.dbscan(lattice, 1.0, 3)[1])
     assert set(labels) == {0}
 
 
 def test_a_few_far_points_do_not_make_the_grid_outgrow_the_points():
     features = np.vstack([points(200, 1), [[1e7, 1e7, 0, 0, 0]], [[-1e7, 1e7, 0, 0, 0]]])
-    np.testing.assert_array_equal(dbscan(features, 0.5, 3)[0], dbscan_reference(features, 0.5, 3)[0])
+    np.testing.assert_array_equal(dbscan(features, 0.5, 3)[0], cluster_reference.dbscan(features, 0.5, 3)[0])
 
 
 def test_no_points_give_no_labels():
@@ -62,3 +63,31 @@ def test_no_points_give_no_labels():
 def test_features_that_cannot_be_clustered_are_refused(features):
     with pytest.raises(ValueError, match="need"):
         dbscan(features, 1.0, 3)
+
+
+def test_known_bounds_give_the_same_labels():
+    features = points(400, 5)
+    bounds = tuple(float(x) for x in (*features[:, :2].min(axis=0), *features[:, :2].max(axis=0) + 1.0))
+    for ours, plain in zip(dbscan(features, 0.6, 4, bounds), dbscan(features, 0.6, 4), strict=True):
+        np.testing.assert_array_equal(ours, plain)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_features_and_sorting_are_those_of_numpy(seed):
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-3.0, 3.0, 300)
+    stroke = np.column_stack(
+        [rng.uniform(1, 90, (300, 2)), np.cos(angle), np.sin(angle), rng.uniform(5, 20, 300), rng.uniform(9, 99, 300)]
+    ).astype(np.float32)
+    results = []
+    for kernels in (_cluster, cluster_reference):
+        features = np.empty((300, 5))
+        kernels.features(stroke, 4.0, 4.0, 0.9, features)
+        labels, counts = dbscan(np.ascontiguousarray(features[:, :2]), 1.2, 4)
+        work, out = np.empty((4, 300), np.int32), np.zeros((300, 6), np.float32)
+        out_counts, first, axis = np.zeros(300, np.int32), np.zeros(9, np.int32), np.zeros(8, np.int32)
+        kept = kernels.sort(stroke, labels, counts, int(labels.max()) + 1, 6, work, out, out_counts, first, axis)
+        results.append((features, kept, first[: kept + 1], axis[:kept], out[: first[kept]], out_counts[: first[kept]]))
+    assert results[0][1] >= 3
+    for ours, plain in zip(*results, strict=True):
+        np.testing.assert_allclose(ours, plain, rtol=1e-6, atol=1e-6)

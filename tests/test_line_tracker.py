@@ -5,10 +5,14 @@ import math
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from robotd.geometry.camera import Camera
 from robotd.records import CameraModel, Line, Pose, Transform
-from robotd.vision.line_tracker import LineTracker, PoseHistory
+from robotd.vision.line_icp import View, motion_between
+from robotd.vision.line_sight import to_robot
+from robotd.vision.line_tracker import LineTracker, PoseHistory, TrackerConfig
 from robotd.vision.stroke import LineConfig, LineDetector
 from robotd.vision.top_view import TopView
 
@@ -37,13 +41,14 @@ def straight_history(*, speed=0.2, turn_rate=0.0, duration=3.0):
 
 
 def seen(path, pose, noise=0.0, seed=0):
-    """The Line that the detector would find of a path in odometry axes."""
+    """The Lines that the detector would find of a path in odometry axes: one for each run of it in view."""
     away = path - np.array([pose.x, pose.y])
     c, s = math.cos(pose.heading), math.sin(pose.heading)
     robot = np.column_stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]])
-    robot = robot[VIEW.shows(robot)]
+    shown = VIEW.shows(robot)
     robot = robot + np.random.default_rng(seed).normal(0.0, noise, robot.shape)
-    return [Line(VIEW.to_pixels(robot), 14.0, 0.9)] if len(robot) > 5 else []
+    runs = np.split(np.arange(len(robot)), np.flatnonzero(np.diff(shown.astype(int))) + 1)
+    return [Line(VIEW.to_pixels(robot[run]), 14.0, 0.9) for run in runs if shown[run[0]] and len(run) > 5]
 
 
 def line_along_x(y=0.0, length=4.0):
@@ -222,3 +227,149 @@ def test_frames_from_unknown_times_change_nothing():
     tracker, history = LineTracker(VIEW), straight_history()
     assert not tracker.observe(seen(line_along_x(), Pose(0, 0, 0)), 99.0, history, 0.0)
     assert len(tracker.path) == 0
+
+
+# ---- where the line can go on in more than one way -------------------------------------------------------------------
+
+
+def bent(angle, at=1.2, length=0.9):
+    """A way on from (at, 0) that turns by `angle` degrees there."""
+    s = np.arange(0.0, length, 0.01)[:, None]
+    return np.array([at, 0.0]) + s * [math.cos(math.radians(angle)), math.sin(math.radians(angle))]
+
+
+def many(*paths):
+    """What is seen of several lines at once."""
+    return lambda pose: [line for k, path in enumerate(paths) for line in seen(path, pose, 0.001, k)]
+
+
+TRUNK = line_along_x(length=1.2)
+
+
+@pytest.mark.parametrize(
+    ("rule", "heading", "direction"),
+    [("straight", 0.0, 0.0), ("left", 0.0, 45.0), ("right", 0.0, -60.0), ("heading", -1.2, -60.0)],
+)
+def test_a_fork_is_taken_as_the_rule_says(rule, heading, direction):
+    tracker = LineTracker(VIEW, config=TrackerConfig(fork=rule, fork_heading=heading))
+    whole = np.vstack([TRUNK, bent(0.0)])
+    lines = many(whole, bent(45.0), bent(-60.0))
+    drive(tracker, None, straight_history(duration=6.0), np.arange(0.0, 4.0, 1 / 30), lines=lines)
+    last = tracker.path[-1] - [1.2, 0.0]
+    assert math.degrees(math.atan2(last[1], last[0])) == pytest.approx(direction, abs=8.0)
+
+
+def test_a_crossing_line_does_not_lead_astray():
+    tracker = LineTracker(VIEW)
+    across = np.column_stack([np.full(120, 1.2), np.linspace(-0.6, 0.6, 120)])
+    history = straight_history(duration=8.0)
+    drive(tracker, None, history, np.arange(0.0, 7.0, 1 / 30), lines=many(line_along_x(length=4.0), across))
+    assert np.abs(tracker.path[:, 1]).max() < 0.005
+    assert tracker.path[-1, 0] > 2.2
+
+
+def test_the_end_of_the_line_is_an_end_only_once_bare_floor_is_seen_beyond_it():
+    tracker, path = LineTracker(VIEW), line_along_x(length=1.5)
+    history = straight_history(duration=8.0)
+    drive(tracker, path, history, np.arange(0.0, 2.0, 1 / 30))
+    assert not tracker.ends  # the view ends before the line does, or soon behind it
+    drive(tracker, path, history, np.arange(2.0, 5.0, 1 / 30))
+    assert tracker.ends
+    assert tracker.path[-1, 0] == pytest.approx(1.5, abs=0.03)
+
+
+def test_a_gap_is_bridged_and_is_no_end():
+    tracker, path = LineTracker(VIEW), line_along_x(length=4.0)
+    torn = [path[path[:, 0] < 1.2], path[path[:, 0] > 1.42]]
+    ends = []
+
+    def lines(pose):
+        ends.append(tracker.ends)
+        return many(*torn)(pose)
+
+    drive(tracker, None, straight_history(duration=8.0), np.arange(0.0, 7.0, 1 / 30), lines=lines)
+    assert not any(ends)
+    assert np.abs(tracker.path[:, 1]).max() < 0.005
+    assert tracker.path[-1, 0] > 2.2
+
+
+def test_lines_found_with_relaxed_limits_keep_us_on_the_line_but_do_not_prolong_it():
+    tracker, history = LineTracker(VIEW), straight_history(duration=6.0)
+    drive(tracker, line_along_x(length=0.9), history, np.arange(0.0, 0.5, 1 / 30))
+    end = tracker.path[-1, 0]
+    assert tracker.begin(0.6, history, 0.12)
+    assert tracker.see(seen(line_along_x(length=3.0), Pose(0.12, 0, 0)), relaxed=True)
+    tracker.finish(True)
+    assert tracker.path[-1, 0] == pytest.approx(end, abs=0.01)
+
+
+# ---- what the line says about the robot's motion ---------------------------------------------------------------------
+
+
+def views(path, first, second, *, noise=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    found = []
+    for t, pose in ((0.0, first), (0.3, second)):
+        robot = to_robot(path, pose)
+        robot = robot[(robot[:, 0] > 0.3) & (robot[:, 0] < 1.0) & (np.abs(robot[:, 1]) < 0.4)]
+        robot = robot + rng.normal(0.0, noise, robot.shape)
+        toward = robot / np.hypot(*robot.T)[:, None]
+        found.append(View(t, robot, np.full(len(robot), 1e-4), toward, 0.2, 0.0))
+    return found
+
+
+def test_a_straight_line_shows_sideways_motion_and_turning_but_says_nothing_along_itself():
+    true = Pose(0.06, 0.004, 0.02)
+    one, two = views(line_along_x(length=3.0), Pose(0, 0, 0), true)
+    moved, information = motion_between(one, two, Pose(0.05, 0.0, 0.0), point_sigma=0.001, jitter=0.0, independent=8.0)
+    assert moved.x == pytest.approx(0.05, abs=0.002)  # odometry's, because the line does not know better
+    assert moved.y == pytest.approx(0.004, abs=1e-3)
+    assert moved.heading == pytest.approx(0.02, abs=1e-4)
+    values, vectors = np.linalg.eigh(information)
+    assert values[0] == pytest.approx(0.0, abs=1e-6)
+    assert abs(vectors[0, 0]) > 0.99
+    assert values[1] > 1e4
+
+
+@given(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02), st.floats(-0.05, 0.05))
+@settings(deadline=None, max_examples=30)
+def test_a_corner_shows_all_of_the_motion(x, y, heading):
+    path = np.vstack([line_along_x(length=0.75), np.column_stack([np.full(60, 0.75), np.arange(0.0, 0.6, 0.01)])])
+    true = Pose(0.06 + x, y, heading)
+    one, two = views(path, Pose(0, 0, 0), true)
+    moved, information = motion_between(one, two, Pose(0.06, 0.0, 0.0), point_sigma=0.001, jitter=0.0, independent=8.0)
+    assert np.allclose([moved.x, moved.y, moved.heading], [true.x, true.y, true.heading], atol=1e-3)
+    assert np.linalg.eigvalsh(information)[0] > 1e4
+
+
+def test_the_information_is_what_the_errors_of_many_motions_say():
+    path = np.vstack([line_along_x(length=0.75), np.column_stack([np.full(60, 0.75), np.arange(0.0, 0.6, 0.01)])])
+    true, squares = Pose(0.06, 0.003, 0.02), []
+    for seed in range(200):
+        one, two = views(path, Pose(0, 0, 0), true, noise=0.001, seed=seed)
+        moved, information = motion_between(
+            one, two, Pose(0.055, 0.0, 0.015), point_sigma=0.001, jitter=0.0, independent=1e9
+        )
+        error = np.array([moved.x - true.x, moved.y - true.y, moved.heading - true.heading])
+        squares.append(error @ information @ error / 3.0)
+    assert 0.6 < np.mean(squares) < 1.4
+
+
+def test_views_of_different_lines_tell_no_motion():
+    one, _ = views(line_along_x(0.3), Pose(0, 0, 0), Pose(0, 0, 0))
+    _, two = views(line_along_x(-0.3), Pose(0, 0, 0), Pose(0, 0, 0))
+    assert motion_between(one, two, Pose(0, 0, 0), point_sigma=0.001, jitter=0.0, independent=8.0) is None
+
+
+def test_what_leaves_the_memory_is_handed_over_once_and_in_order():
+    tracker, path = LineTracker(VIEW), line_along_x(length=8.0)
+    history, points, travelled = straight_history(duration=10.0), [], []
+    for t in np.arange(0.0, 9.9, 1 / 30):
+        drive(tracker, path, history, [t])
+        piece, at = tracker.finished()
+        points, travelled = [*points, *piece], [*travelled, *at]
+    rest, at = tracker.rest()
+    points, travelled = np.array([*points, *rest]), np.array([*travelled, *at])
+    assert (np.diff(points[:, 0]) > 0.0).all()
+    assert np.abs(points[:, 1]).max() < 0.004
+    np.testing.assert_allclose(travelled, points[:, 0], atol=0.03)

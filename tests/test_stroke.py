@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robotd.vision import _stroke, stroke_reference
+from robotd.vision import _stroke, cluster_reference, measure_reference, polyline_reference, stroke_reference
 from robotd.vision.polyline import arc_length
 from robotd.vision.stroke import LineConfig, LineDetector
 
@@ -199,56 +199,47 @@ def scene(seed):
     return cv2.Sobel(blurred, cv2.CV_16S, 1, 0), cv2.Sobel(blurred, cv2.CV_16S, 0, 1), valid
 
 
-def run(kernels, seed, sign=-1.0, most=2700):
+def run(kernels, seed, sign=-1.0, most=2700, masked=True):
     gx, gy, valid = scene(seed)
-    magnitude, index = np.empty(gx.shape, np.float32), np.empty(gx.shape, np.int32)
+    if not masked:
+        valid = np.empty((0, 0), np.uint8)
+    index, sector = np.full(gx.shape, -1, np.int32), np.empty(gx.shape, np.uint8)
     edge, partner, stroke = np.empty((most, 5), np.float32), np.empty(most, np.int32), np.empty((most, 6), np.float32)
-    found, level = kernels.edges(gx, gy, valid, 1.3, 24.0, 90.0, magnitude, index, edge)
-    count = kernels.strokes(edge, found, index, 8.0, 15.0, sign, 0.88, 0.4, partner, stroke)
-    return found, level, magnitude, index, edge[:found], partner[:found], stroke[:count]
+    found, level = kernels.edges(gx, gy, valid, 1.3, 24.0, 90.0, index, sector, edge)
+    count = kernels.strokes(edge, found, index, sector, 8.0, 15.0, sign, 0.88, 0.4, partner, stroke)
+    return found, level, sector, np.where(sector > 0, index, -1), edge[:found], partner[:found], stroke[:count]
 
 
+@pytest.mark.parametrize("masked", [True, False])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("seed", range(8))
-def test_edges_and_strokes_are_those_of_numpy(seed, sign):
-    ours, plain = run(_stroke, seed, sign), run(stroke_reference, seed, sign)
-    assert ours[0] == plain[0]
+def test_edges_and_strokes_are_those_of_numpy(seed, sign, masked):
+    ours, plain = run(_stroke, seed, sign, masked=masked), run(stroke_reference, seed, sign, masked=masked)
+    assert ours[0] == plain[0] > 100
     assert ours[1] == pytest.approx(plain[1], rel=1e-5)
-    np.testing.assert_array_equal(ours[3], plain[3])
-    np.testing.assert_array_equal(ours[5], plain[5])
-    for k in (2, 4, 6):
+    for k in (2, 3, 5):
+        np.testing.assert_array_equal(ours[k], plain[k])
+    for k in (4, 6):
         np.testing.assert_allclose(ours[k], plain[k], rtol=1e-5, atol=1e-4)
 
 
 def test_kernels_drop_what_does_not_fit_their_buffers():
     ours, plain = run(_stroke, 3, most=50), run(stroke_reference, 3, most=50)
     assert ours[0] == plain[0] == 50
+    np.testing.assert_array_equal(ours[3], plain[3])
     np.testing.assert_allclose(ours[4], plain[4], rtol=1e-5, atol=1e-4)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_traces_and_claims_are_those_of_numpy(seed):
-    stroke = run(_stroke, seed)[6]
-    results = []
-    for kernels in (_stroke, stroke_reference):
-        state = np.ones(len(stroke), np.uint8)
-        state[::17] = 0
-        out = np.empty((200, 2), np.float32)
-        u, v, du, dv = (float(x) for x in stroke[len(stroke) // 2, :4])
-        passed = kernels.trace(stroke, state, u, v, du, dv, 4.4, 3.3, 22.0, 3, 0.82, out)
-        points = out[: passed[0]].copy()
-        results.append((passed, points, kernels.claim(stroke, state, points, 5.5, 0.82), state))
-    (ours, points, claimed, state), (plain, expected, also, wanted) = results
-    assert ours == plain
-    assert claimed == also
-    np.testing.assert_allclose(points, expected, atol=1e-3)
-    np.testing.assert_array_equal(state, wanted)
 
 
 def test_the_plain_kernels_find_the_same_lines(monkeypatch):
     image = draw([[(0, 60), (170, 60), (170, 239)]], 16)
     expected = LineDetector(LineConfig("dark", (13, 20))).detect(image)
-    monkeypatch.setattr("robotd.vision.stroke.kernels", stroke_reference)
+    plain = dict(
+        kernels=stroke_reference, clustering=cluster_reference, tracing=polyline_reference, measuring=measure_reference
+    )
+    for name, module in plain.items():
+        monkeypatch.setattr(f"robotd.vision.stroke.{name}", module)
+    monkeypatch.setattr("robotd.vision.cluster.kernels", cluster_reference)
     lines = LineDetector(LineConfig("dark", (13, 20))).detect(image)
     assert len(lines) == len(expected) == 1
     np.testing.assert_allclose(lines[0].points, expected[0].points, atol=0.02)
+    np.testing.assert_allclose(lines[0].curvature, expected[0].curvature, atol=1e-3)

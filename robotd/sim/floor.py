@@ -20,6 +20,7 @@ from ..geometry.transforms import invert_rigid
 from ..records import CameraModel, Floats
 from .floor_tiles import PITCH, dirt_tile, floor_image, floor_tile
 from .layout import StoreLayout
+from .line import LineGeometry
 from .settings import WorldSettings
 
 Image = NDArray[np.uint8]
@@ -312,13 +313,41 @@ def _edge_map(layout: StoreLayout) -> tuple[NDArray[np.int16], float]:
     pitch = min(0.02, max(0.004, math.sqrt(width * depth / 4e6)))
     columns, rows = math.ceil(width / pitch), math.ceil(depth / pitch)
     edge = np.full((rows, columns), OUTSIDE * EDGE_STEP, np.float32)
-    half = layout.line.width / 2
+    line = layout.line
+    half = line.width / 2
     margin = half + 4 * pitch + 0.1
-    for piece in layout.geometry.tape():
-        (x0, y0), (x1, y1) = piece.low - margin, piece.high + margin
+
+    def area(low: Floats, high: Floats) -> tuple[Single, Floats, Floats]:
+        """The part of the map around a box, and its cells' x and y."""
+        (x0, y0), (x1, y1) = low - margin, high + margin
         c0, c1 = max(0, int(x0 / pitch)), min(columns, int(x1 / pitch) + 2)
         r0, r1 = max(0, int(y0 / pitch)), min(rows, int(y1 / pitch) + 2)
         y, x = (np.mgrid[r0:r1, c0:c1] + 0.5) * pitch
-        area = edge[r0:r1, c0:c1]
-        np.minimum(area, piece.edge_distance(x, y, half), out=area, casting="same_kind")
+        return edge[r0:r1, c0:c1], x, y
+
+    def lay(geometry: LineGeometry, half: float) -> None:
+        for piece in geometry.tape():
+            part, x, y = area(piece.low, piece.high)
+            np.minimum(part, piece.edge_distance(x, y, half), out=part, casting="same_kind")
+
+    lay(layout.geometry, half)
+    for start, length in line.gaps:
+        geometry = layout.geometry
+        torn = geometry.point_at(start + np.linspace(0.0, length, 2 + math.ceil(length / 0.05)))
+        part, x, y = area(torn.min(axis=0), torn.max(axis=0))
+        offset, s = geometry.nearest(np.stack([x, y], axis=-1))
+        inside = np.minimum(s - start, start + length - s)
+        np.maximum(part, np.where(np.abs(offset) < margin, inside, -np.inf), out=part, casting="same_kind")
+    for tape in layout.tapes:
+        lay(LineGeometry(tape.points, closed=tape.closed, corner_radius=tape.corner_radius), tape.width / 2)
+    for mark in layout.marks:
+        centre, reach = np.array(mark.position), mark.size / 2
+        part, x, y = area(centre - reach, centre + reach)
+        dx, dy = x - centre[0], y - centre[1]
+        if mark.shape == "dot":
+            distance = np.hypot(dx, dy) - reach
+        else:
+            cos, sin = math.cos(mark.heading), math.sin(mark.heading)
+            distance = np.maximum(np.abs(cos * dx + sin * dy), np.abs(cos * dy - sin * dx)) - reach
+        np.minimum(part, distance, out=part, casting="same_kind")
     return np.rint(np.clip(edge / EDGE_STEP, -OUTSIDE, OUTSIDE)).astype(np.int16), pitch

@@ -24,7 +24,7 @@ class Floor:
 
 @dataclass(frozen=True, slots=True)
 class LineLayout:
-    """[line]: the tape; `stops` are arc lengths from the first point."""
+    """[line]: the tape; `stops` are arc lengths from the first point, `gaps` (arc length, length) where it is torn."""
 
     points: tuple[Point, ...]
     stops: tuple[float, ...]
@@ -32,6 +32,27 @@ class LineLayout:
     color: Literal["dark", "bright"] = "dark"
     closed: bool = False
     corner_radius: float = ranged(0.0, minimum=0.0, maximum=10.0)
+    gaps: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tape:
+    """[[tapes]]: more tape like the line's, which is not to be followed: crossings, branches, a line beside it."""
+
+    points: tuple[Point, ...]
+    width: float = ranged(0.050, minimum=0.005, maximum=0.3)
+    closed: bool = False
+    corner_radius: float = ranged(0.0, minimum=0.0, maximum=10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """[[marks]]: a square or a dot of the line's tape, `size` across, turned by `heading` radians."""
+
+    position: Point
+    size: float = ranged(0.050, minimum=0.005, maximum=0.3)
+    shape: Literal["square", "dot"] = "square"
+    heading: float = ranged(0.0, minimum=-6.3, maximum=6.3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +153,8 @@ class StoreLayout:
     size: tuple[float, float]
     line: LineLayout
     floor: Floor = field(default_factory=Floor)
+    tapes: tuple[Tape, ...] = ()
+    marks: tuple[Mark, ...] = ()
     walls: tuple[Wall, ...] = ()
     shelves: tuple[Shelf, ...] = ()
     labels: tuple[LabelLayout, ...] = ()

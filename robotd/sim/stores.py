@@ -33,6 +33,7 @@ from .layout import (
     RoofCameraLayout,
     Shelf,
     StoreLayout,
+    Tape,
     Walker,
     Wall,
 )
@@ -141,6 +142,7 @@ class _Checks:
         self._check_areas()
         self._check_labels()
         self._check_others()
+        self._check_tapes()
         if line is not None:
             self._check_line(line)
 
@@ -230,6 +232,13 @@ class _Checks:
         if floor is not None and floor.image is not None and not (self.path.parent / floor.image).is_file():
             self._problem("floor.image", str(floor.image), f"an image file in {self.path.parent} or an absolute path")
 
+    def _check_tapes(self) -> None:
+        for index, tape in self._parts("tapes", Tape):
+            try:
+                LineGeometry(tape.points, closed=tape.closed, corner_radius=tape.corner_radius)
+            except ConfigError as error:
+                self.problems.extend(f"{self.path} tapes[{index}].{problem}" for problem in error.problems)
+
     def _check_line(self, line: LineLayout) -> None:
         if self.size is not None:
             for index, (x, y) in enumerate(line.points):
@@ -254,6 +263,9 @@ class _Checks:
     def _check_stops(self, line: LineLayout, length: float) -> None:
         if not line.stops:
             self._problem("line.stops", line.stops, "at least one arc length; the robot starts at the first")
+        for index, (start, gap) in enumerate(line.gaps):
+            if gap <= 0.0 or start < 0.0 or start + gap > length:
+                self._problem(f"line.gaps[{index}]", (start, gap), f"a piece of the line, 0 to {length:.3f} m")
         for index, stop in enumerate(line.stops):
             if index and stop <= line.stops[index - 1]:
                 self._problem(f"line.stops[{index}]", stop, f"more than stops[{index - 1}] = {line.stops[index - 1]:g}")

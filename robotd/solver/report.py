@@ -27,6 +27,7 @@ GRID = 0.5  # m
 MANY = 120  # labels or stops: beyond it names would only cover one another
 
 INK, MUTED, FAINT, WALL = "#1c2127", "#6b7480", "#e3e6ea", "#c3c9d1"
+LINE = "#b9b1a3"
 ESTIMATE, TRUTH, ODOMETRY, ADJUSTED = "#f08a12", "#c2183a", "#4a7bd0", "#0a7d6c"
 
 ERRORS = (("mean", "mean"), ("median", "median"), ("p95", "95 %"), ("max", "max"))
@@ -110,6 +111,7 @@ def map_png(
     truth: Mapping[str, Vector3] | None = None,
     outline: Sequence[ArrayLike] = (),
     trail: ArrayLike | None = None,
+    line: Sequence[ArrayLike] = (),
 ) -> None:
     """Draw the map from above, 1600x1200 pixels.
 
@@ -126,6 +128,8 @@ def map_png(
         Walls (open polylines) and shelves (closed ones) in world metres.
     trail : (N, 2) array, optional
         Odometry of the first leg in full, in its own frame.
+    line : sequence of (N, 2) arrays, optional
+        The line on the floor as the robot saw it, in world metres, in pieces.
 
     Raises
     ------
@@ -145,6 +149,8 @@ def map_png(
     figure.text(0.06, 0.922, f"{_counts(result)} · {method} · {result.rms_px:.2g} px rms", size=9.5, color=MUTED)
 
     _draw_outline(axes, outline)
+    for piece in (np.asarray(points, dtype=np.float64) for points in line):
+        axes.plot(*piece.T, color=LINE, linewidth=3.2, solid_capstyle="butt", label="line on the floor", zorder=1.5)
     _draw_paths(axes, result, _odometry_paths(result, survey, trail))
     _draw_labels(axes, result, truth)
     span = _frame(axes, result, truth, outline)
@@ -390,6 +396,7 @@ def map_html(
     survey: Survey | None = None,
     truth: Mapping[str, Vector3] | None = None,
     outline3d: Sequence[tuple[ArrayLike, float]] = (),
+    line: Sequence[ArrayLike] = (),
 ) -> None:
     """Write a page with the map in three dimensions and a table of the labels; it needs no network.
 
@@ -401,6 +408,8 @@ def map_html(
         As `map_png`.
     outline3d : sequence of ((N, 2) array, height), optional
         Walls and shelves in world metres, standing on the floor.
+    line : sequence of (N, 2) arrays, optional
+        As `map_png`.
 
     Raises
     ------
@@ -408,7 +417,7 @@ def map_html(
         If the file cannot be written.
     """
     page = resources.files("robotd.solver").joinpath("map_view.html").read_text(encoding="utf-8")
-    data = json.dumps(_page_data(result, survey, truth, outline3d), allow_nan=False, ensure_ascii=True)
+    data = json.dumps(_page_data(result, survey, truth, outline3d, line), allow_nan=False, ensure_ascii=True)
     for character in "<>&":  # so that no label can end the script element
         data = data.replace(character, f"\\u{ord(character):04x}")
     head, tail = page.split("__DATA__")
@@ -421,6 +430,7 @@ def _page_data(
     survey: Survey | None,
     truth: Mapping[str, Vector3] | None,
     outline3d: Sequence[tuple[ArrayLike, float]],
+    line: Sequence[ArrayLike] = (),
 ) -> dict[str, Any]:
     """What the page shows: metres rounded to 0.1 mm, angles in radians."""
     errors = _errors_mm(result, truth or {})
@@ -453,6 +463,7 @@ def _page_data(
             for stops in _legs(result).values()
         ],
         "odometry": [np.round(path, 4).tolist() for path in _odometry_paths(result, survey, None)],
+        "line": [np.round(np.asarray(points, dtype=np.float64), 4).tolist() for points in line],
         "solids": [
             {"points": np.round(np.asarray(points, dtype=np.float64)[:, :2], 4).tolist(), "height": round(height, 4)}
             for points, height in outline3d

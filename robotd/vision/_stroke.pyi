@@ -8,14 +8,15 @@ def edges(
     factor: float,
     low: float,
     high: float,
-    magnitude: NDArray[np.float32],
     index: NDArray[np.int32],
+    sector: NDArray[np.uint8],
     out: NDArray[np.float32],
 ) -> tuple[int, float]: ...
 def strokes(
     edge: NDArray[np.float32],
     count: int,
     index: NDArray[np.int32],
+    sector: NDArray[np.uint8],
     low: float,
     high: float,
     sign: float,
@@ -23,25 +24,4 @@ def strokes(
     mutual: float,
     partner: NDArray[np.int32],
     out: NDArray[np.float32],
-) -> int: ...
-def trace(
-    stroke: NDArray[np.float32],
-    state: NDArray[np.uint8],
-    u: float,
-    v: float,
-    du: float,
-    dv: float,
-    step: float,
-    radius: float,
-    gap: float,
-    least: int,
-    aligned: float,
-    out: NDArray[np.float32],
-) -> tuple[int, int, int, bool]: ...
-def claim(
-    stroke: NDArray[np.float32],
-    state: NDArray[np.uint8],
-    points: NDArray[np.float32],
-    radius: float,
-    aligned: float,
 ) -> int: ...

@@ -1,11 +1,12 @@
-"""Polylines: arc length, resampling, directions, joining of ends, and the extension to a border."""
+"""Polylines: arc length, resampling, directions, and corners."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..records import Floats
+
+SHARP = 0.78  # radians, 45 degrees: below it a turn from arm to arm is no corner
 
 
 def arc_length(points: Floats) -> Floats:
@@ -41,53 +42,55 @@ def end_direction(points: Floats, reach: float) -> Floats:
     return unit
 
 
-def bridge(first: Floats, second: Floats, width: float) -> Floats | None:
-    """What joins the end of one polyline to the start of another of the same width, or None if they do not belong.
+def sharpened(points: Floats, width: float) -> Floats:
+    """Put back corners that were cut: two straight arms at more than 45 degrees are prolonged to their crossing.
 
-    Two ends belong together when they face each other over a gap of at most 2 widths, or when both, prolonged, meet
-    in a corner at most 2 widths ahead: the outer border of a corner has no partner, so strokes end before it.
-
-    Returns
-    -------
-    (K, 2) array of the points between: none for a gap, the corner's point for a corner.
+    A curve is none: if its radius is above 3.6 widths it turns less between the arms, and if it is below, the arms
+    bend by more than a twentieth of the width.
     """
-    gap = second[0] - first[-1]
-    distance = float(np.hypot(*gap))
-    if distance > 3.0 * width:
-        return None
-    out = end_direction(first, width)
-    into = -end_direction(second[::-1], width)
-    facing = float(out @ into)
-    if distance < 1e-9:
-        return np.empty((0, 2)) if facing > 0.5 else None
-    if facing > 0.9 and min(out @ gap, into @ gap) > 0.9 * distance and distance <= 2.25 * width:
-        return np.empty((0, 2))
-    if abs(facing) > 0.87:  # nearly parallel: their crossing is not a corner
-        return None
-    ahead, behind = np.linalg.solve(np.column_stack([out, into]), gap)
-    if not (-0.75 * width <= ahead <= 2.0 * width and -0.75 * width <= behind <= 2.0 * width):
-        return None
-    corner: Floats = first[-1] + ahead * out
-    return corner[None]
-
-
-def cut_back(points: Floats, corner: Floats) -> Floats:
-    """The polyline without what lies beyond the foot of `corner` at its last end; at least two points remain."""
-    out = end_direction(points, float(np.hypot(*(points[-1] - points[0]))) + 1e-9)
-    keep = (points - corner) @ out < 0.0
-    count = max(int(np.flatnonzero(keep)[-1]) + 1 if keep.any() else 2, 2)
-    return points[:count]
-
-
-def extend(points: Floats, valid: NDArray[np.uint8], reach: float) -> Floats:
-    """Prolong the last end straight on if it meets the border of the valid area within `reach` pixels."""
-    out = end_direction(points, reach)
-    steps = np.arange(1.0, reach + 1.0)
-    ahead = points[-1] + steps[:, None] * out
-    cells = np.floor(ahead + 0.5).astype(int)
-    inside = (cells >= 0).all(axis=1) & (cells[:, 0] < valid.shape[1]) & (cells[:, 1] < valid.shape[0])
-    usable = np.zeros(len(steps), dtype=bool)
-    usable[inside] = valid[cells[inside, 1], cells[inside, 0]] > 0
-    if usable.all() or not usable[0]:
+    lengths = arc_length(points)
+    spacing = float(lengths[-1]) / (len(points) - 1)
+    near, far = max(round(0.8 * width / spacing), 1), max(round(2.0 * width / spacing), 3)
+    least = max(round(0.6 * width / spacing), 2)
+    done: list[int] = []
+    n = len(points)
+    if n < 2 * (near + least) + 1:
         return points
-    return np.vstack([points, ahead[int(np.argmin(usable)) - 1]])
+    middle = np.arange(near + least, n - near - least)
+    start, stop = np.maximum(middle - far, 0), np.minimum(middle + far, n - 1)
+    one, two = points[middle - near] - points[start], points[stop] - points[middle + near]
+    dot = (one * two).sum(axis=1)
+    cross = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+    turn = np.abs(np.arctan2(cross, dot))
+    order = np.argsort(-turn, kind="stable")
+    cuts: list[tuple[int, int, Floats]] = []
+    for k in order:
+        if turn[k] < SHARP:
+            break
+        i = int(middle[k])
+        if any(abs(i - other) < far for other in done):
+            continue
+        done.append(i)
+        a, b, c, d = int(start[k]), i - near, i + near, int(stop[k])
+        if _bow(points[a : b + 1]) > 0.06 * width or _bow(points[c : d + 1]) > 0.06 * width:
+            continue
+        matrix = np.column_stack([one[k], two[k]])
+        ahead, behind = np.linalg.solve(matrix, points[c] - points[b])
+        corner = points[b] + ahead * one[k]
+        if ahead > 0.0 and behind > 0.0 and np.hypot(*(corner - points[i])) < 1.2 * width:
+            cuts.append((b, c, corner))
+    for b, c, corner in sorted(cuts, key=lambda cut: -cut[0]):
+        first = int(np.hypot(*(corner - points[b])) / spacing) + 1
+        second = int(np.hypot(*(points[c] - corner)) / spacing) + 1
+        into = points[b] + np.linspace(0.0, 1.0, first + 1)[1:, None] * (corner - points[b])
+        out = corner + np.linspace(0.0, 1.0, second + 1)[1:-1, None] * (points[c] - corner)
+        points = np.vstack([points[: b + 1], into, out, points[c:]])
+    return points
+
+
+def _bow(points: Floats) -> float:
+    """Greatest distance of points (N, 2) from the straight way from the first to the last."""
+    chord = points[-1] - points[0]
+    size = max(float(np.hypot(*chord)), 1e-12)
+    away = points - points[0]
+    return float(np.abs(away[:, 0] * chord[1] - away[:, 1] * chord[0]).max()) / size

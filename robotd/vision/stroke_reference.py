@@ -7,16 +7,12 @@ Strokes are rows (u, v, tu, tv, width, strength): the midpoint between two oppos
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import NDArray
 
 Singles = NDArray[np.float32]
 Integers = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
-
-_ONE = np.float32(1.0)
 
 
 def edges(
@@ -26,8 +22,8 @@ def edges(
     factor: float,
     low: float,
     high: float,
-    magnitude: Singles,
     index: Integers,
+    sector: Bytes,
     out: Singles,
 ) -> tuple[int, float]:
     """Thin edges: pixels whose gradient is a local maximum along the axis that it is nearest to.
@@ -40,9 +36,11 @@ def edges(
     gx, gy : (H, W) int16 arrays
         Sobel derivatives.
     valid : (H, W) uint8 array
-        1 where the derivatives may be used, 0 elsewhere.
-    magnitude, index : (H, W) arrays to fill
-        Gradient length (0 where invalid), and the row of `out` for each thin edge pixel (-1 elsewhere).
+        1 where the derivatives may be used, 0 elsewhere; no rows if all may be.
+    sector : (H, W) uint8 array to fill
+        0 where there is no thin edge, else 1 + which sixteenth of the circle its gradient is in, from +u towards +v.
+    index : (H, W) array to fill
+        For each thin edge pixel its row of `out`; undefined elsewhere.
     out : (N, 5) array to fill with edges, row by row of the image; further ones are dropped.
 
     Returns
@@ -50,17 +48,21 @@ def edges(
     How many edges were found, and the threshold.
     """
     wide_x, wide_y = gx.astype(np.int32), gy.astype(np.int32)
-    magnitude[:] = np.sqrt((wide_x * wide_x + wide_y * wide_y).astype(np.float32)) * valid
-    level = factor * float(magnitude.sum(dtype=np.float64)) / max(int(valid.sum(dtype=np.int64)), 1)
-    level = float(np.float32(min(max(level, low), high)))
+    usable = np.ones(gx.shape, bool) if len(valid) == 0 else valid > 0
+    total = int(((np.abs(wide_x) + np.abs(wide_y)) * usable)[::2].sum(dtype=np.int64))  # every other row says enough
+    # the mean over all directions of |cos| + |sin| is 4 / pi
+    mean = np.float32(factor) * np.float32(0.7853982) * np.float32(total / max(int(usable[::2].sum()), 1))
+    level = np.float32(min(max(float(mean), low), high))
+    square = wide_x * wide_x + wide_y * wide_y
     across = (wide_x * wide_x >= wide_y * wide_y)[1:-1, 1:-1]
-    here = magnitude[1:-1, 1:-1]
-    before = np.where(across, magnitude[1:-1, :-2], magnitude[:-2, 1:-1])
-    after = np.where(across, magnitude[1:-1, 2:], magnitude[2:, 1:-1])
-    peak = (here >= np.float32(level)) & (before != 0) & (after != 0) & (here >= before) & (here > after)
+    here = square[1:-1, 1:-1]
+    before = np.where(across, square[1:-1, :-2], square[:-2, 1:-1])
+    after = np.where(across, square[1:-1, 2:], square[2:, 1:-1])
+    peak = (here > int(level * level)) & (here >= before) & (here > after) & usable[1:-1, 1:-1]
+    peak &= np.where(across, usable[1:-1, :-2] & usable[1:-1, 2:], usable[:-2, 1:-1] & usable[2:, 1:-1])
     rows, cols = np.nonzero(peak)
     rows, cols = rows[: len(out)], cols[: len(out)]
-    a, b, c = before[rows, cols], here[rows, cols], after[rows, cols]
+    a, b, c = (np.sqrt(part[rows, cols].astype(np.float32)) for part in (before, here, after))
     shift = np.float32(0.5) * (a - c) / (a - np.float32(2.0) * b + c)
     across = across[rows, cols]
     rows, cols, found = rows + 1, cols + 1, len(rows)
@@ -69,15 +71,26 @@ def edges(
     out[:found, 2] = gx[rows, cols] / b
     out[:found, 3] = gy[rows, cols] / b
     out[:found, 4] = b
-    index[:] = -1
     index[rows, cols] = np.arange(found, dtype=np.int32)
-    return found, level
+    sector[:] = 0
+    sector[rows, cols] = 1 + _sector(gx[rows, cols].astype(np.float32), gy[rows, cols].astype(np.float32))
+    return found, float(level)
+
+
+def _sector(x: Singles, y: Singles) -> NDArray[np.int64]:
+    """Which of 16 equal sectors directions lie in, counted from the one after +u towards +v."""
+    wide, high, tangent = np.abs(x), np.abs(y), np.float32(0.41421356)
+    flat = np.where(high < tangent * wide, 0, 1)
+    part = np.where(high <= wide, flat, np.where(wide > tangent * high, 2, 3))
+    below = y >= 0.0
+    return np.where(x >= 0.0, np.where(below, part, 15 - part), np.where(below, 7 - part, 8 + part))
 
 
 def strokes(
     edge: Singles,
     count: int,
     index: Integers,
+    sector: Bytes,
     low: float,
     high: float,
     sign: float,
@@ -90,7 +103,7 @@ def strokes(
 
     The walk takes whole pixels along the longer axis, looks one pixel to each side of it, passes over edges that are
     not opposite (texture inside the line) and ends at the first partner whose gradient opposes (dot product below
-    -`parallel`) at a distance, along the mean normal, from `low` to `high`.
+    -`parallel`, at most 45 degrees) at a distance, along the mean normal, from `low` to `high`.
 
     Parameters
     ----------
@@ -101,7 +114,8 @@ def strokes(
 
     Returns
     -------
-    How many strokes were found. Thesis section 5.2.3 without its split into start and end pixels (errata B10).
+    How many strokes were found; two edges that are each other's partners make one. Thesis section 5.2.3 without its
+    split into start and end pixels (errata B10).
     """
     height, width = index.shape
     edge = edge[:count]
@@ -111,44 +125,44 @@ def strokes(
     direction = np.float32(sign) * edge[:, 2:4]
     horizontal = np.abs(direction[:, 0]) >= np.abs(direction[:, 1])
     major = np.where(horizontal, np.abs(direction[:, 0]), np.abs(direction[:, 1]))
-    direction = direction / major[:, None]
+    pace = (direction / major[:, None] * np.float32(65536.0)).astype(np.int64)  # 16 bits of fraction
+    start = ((edge[:, :2] + np.float32(0.5)) * np.float32(65536.0)).astype(np.int64)
     first = np.maximum((np.float32(low) * major).astype(int) - 1, 1)
     last = (np.float32(high) * major).astype(int) + 2
     walking = np.ones(count, dtype=bool)
     for step in range(int(first.min()), int(last.max())):
-        at = np.floor(edge[:, :2] + direction * np.float32(step) + np.float32(0.5)).astype(int)
+        at = (start + pace * step) >> 16
         started = step >= first
-        inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
+        inside = (at >= 1).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
         walking &= (step < last) & (inside | ~started)
         for side in (0, 1, -1):
             active = np.flatnonzero(walking & started & (partner[:count] < 0))
             col = at[active, 0] + np.where(horizontal[active], 0, side)
             row = at[active, 1] + np.where(horizontal[active], side, 0)
-            fits = (col >= 0) & (row >= 0) & (col < width) & (row < height)
-            active, col, row = active[fits], col[fits], row[fits]
-            other = index[row, col]
-            active, other = active[other >= 0], other[other >= 0]
+            marked = sector[row, col] > 0
+            active, other = active[marked], index[row[marked], col[marked]]
             opposite = (edge[active, 2:4] * edge[other, 2:4]).sum(axis=1) <= -np.float32(parallel)
             active, other = active[opposite], other[opposite]
             across = np.float32(sign) * _across(edge[active], edge[other])
             fits = (across >= np.float32(low)) & (across <= np.float32(high))
             partner[active[fits]] = other[fits]
-    start = np.flatnonzero(partner[:count] >= 0)
-    start = start[partner[partner[start]] >= 0]
-    end = partner[start]
+    begin = np.flatnonzero(partner[:count] >= 0)
+    begin = begin[partner[partner[begin]] >= 0]
+    begin = begin[(partner[partner[begin]] != begin) | (partner[begin] >= begin)]
+    end = partner[begin]
     back = partner[end]
-    across = np.float32(sign) * _across(edge[start], edge[end])
-    gap = ((edge[back, :2] - edge[start, :2]) ** 2).sum(axis=1)
+    across = np.float32(sign) * _across(edge[begin], edge[end])
+    gap = ((edge[back, :2] - edge[begin, :2]) ** 2).sum(axis=1)
     kept = (gap <= 4.0) | (gap <= (np.float32(mutual) * across) ** 2)
-    start, end, across = start[kept][: len(out)], end[kept][: len(out)], across[kept][: len(out)]
-    normal = edge[start, 2:4] - edge[end, 2:4]
+    begin, end, across = begin[kept][: len(out)], end[kept][: len(out)], across[kept][: len(out)]
+    normal = edge[begin, 2:4] - edge[end, 2:4]
     normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
-    found = len(start)
-    out[:found, :2] = np.float32(0.5) * (edge[start, :2] + edge[end, :2])
+    found = len(begin)
+    out[:found, :2] = np.float32(0.5) * (edge[begin, :2] + edge[end, :2])
     out[:found, 2] = -normal[:, 1]
     out[:found, 3] = normal[:, 0]
     out[:found, 4] = across
-    out[:found, 5] = np.minimum(edge[start, 4], edge[end, 4])
+    out[:found, 5] = np.minimum(edge[begin, 4], edge[end, 4])
     return found
 
 
@@ -158,93 +172,3 @@ def _across(edge: Singles, other: Singles) -> Singles:
     normal = normal / np.sqrt((normal * normal).sum(axis=1, keepdims=True))
     along: Singles = ((other[:, :2] - edge[:, :2]) * normal).sum(axis=1)
     return along
-
-
-def trace(
-    stroke: Singles,
-    state: Bytes,
-    u: float,
-    v: float,
-    du: float,
-    dv: float,
-    step: float,
-    radius: float,
-    gap: float,
-    least: int,
-    aligned: float,
-    out: Singles,
-) -> tuple[int, int, int, bool]:
-    """Follow stroke centres from (u, v) in direction (du, dv), one `step` at a time.
-
-    Each new point is the mean of the strokes in a window round the predicted one (`step` to either side along,
-    `radius` across, tangents within acos(`aligned`)); their mean tangent is the next direction. Where fewer than
-    `least` strokes are in the window, windows up to `gap` ahead are tried, each a little wider.
-
-    Parameters
-    ----------
-    state : (N,) uint8 array
-        0 strokes to ignore, 1 free ones, 2 ones that an earlier line claimed: the trace stops where it meets those.
-    out : (M, 2) array to fill with points; the trace ends when it is full.
-
-    Returns
-    -------
-    How many points, how many windows held strokes, how many were passed, and whether the trace came back to its start.
-    """
-    found = filled = travelled = 0
-    at, direction = np.array([u, v], np.float32), np.array([du, dv], np.float32)
-    start, start_direction = at, direction
-    free = state > 0
-    while found < len(out) - 1:
-        for jump in range(1, int(gap / step) + 2):
-            middle = at + direction * np.float32(step * jump)
-            wide = radius * (1.0 + 0.25 * (jump - 1))
-            along, across, turn = _relative(stroke, middle, direction)
-            inside = free & (np.abs(along) <= step) & (np.abs(across) <= wide) & (np.abs(turn) >= aligned)
-            count = int(inside.sum())
-            if count == 0:
-                continue
-            claimed = float((state[inside] == 2).mean())
-            mean_along, mean_across = along[inside].mean(), across[inside].mean()
-            if count >= least and mean_along > -0.75 * step and not (jump > 1 and claimed > 0.5):
-                break
-        else:
-            break
-        if claimed > 0.6:
-            break
-        tangent = (stroke[inside, 2:4] * np.where(turn[inside] > 0, _ONE, -_ONE)[:, None]).mean(axis=0)
-        at = middle + mean_along * direction + mean_across * np.array([-direction[1], direction[0]])
-        direction = tangent / np.sqrt((tangent * tangent).sum())
-        out[found] = at
-        found, filled, travelled = found + 1, filled + 1, travelled + jump
-        home = ((at - start) ** 2).sum() < step * step and direction @ start_direction > aligned
-        if travelled > 6 and home:
-            return found, filled, travelled, True
-    along, across, turn = _relative(stroke, at, direction)
-    ahead = (state == 1) & (along > 0) & (along <= 1.5 * step) & (np.abs(across) <= radius) & (np.abs(turn) >= aligned)
-    if ahead.any():
-        out[found] = at + along[ahead].max() * direction
-        found += 1
-    return found, filled, travelled, False
-
-
-def _relative(stroke: Singles, at: Singles, direction: Singles) -> tuple[Singles, Singles, Singles]:
-    """Each stroke's place along and across a direction, and the cosine of its tangent to it."""
-    ru, rv = stroke[:, 0] - at[0], stroke[:, 1] - at[1]
-    along = ru * direction[0] + rv * direction[1]
-    across = rv * direction[0] - ru * direction[1]
-    return along, across, stroke[:, 2] * direction[0] + stroke[:, 3] * direction[1]
-
-
-def claim(stroke: Singles, state: Bytes, points: Singles, radius: float, aligned: float) -> int:
-    """Mark the free strokes within `radius` of a polyline and along it as claimed; returns how many."""
-    count = 0
-    for first, second in pairwise(points):
-        length = float(np.sqrt(((second - first) ** 2).sum()))
-        if length <= 0.0:
-            continue
-        along, across, turn = _relative(stroke, first, (second - first) / np.float32(length))
-        near = (along >= -radius) & (along <= length + radius) & (np.abs(across) <= radius) & (np.abs(turn) >= aligned)
-        near &= state == 1
-        state[near] = 2
-        count += int(near.sum())
-    return count

@@ -1,0 +1,154 @@
+"""Where the line can go on in more than one way: forks, crossings, corners and ends, and which way is ours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..records import Floats
+from .line_icp import nearest
+from .line_map import LineMap
+from .line_sight import Sight
+from .polyline import arc_length, end_direction
+
+Rule = Literal["straight", "left", "right", "heading"]
+
+REACH = 0.20  # m of a branch that say where it goes
+LEAST = 0.14  # m of a branch that are worth looking at
+PASSING = 0.10  # m from the line's middle to where a branch may begin: strokes end before a junction
+PARALLEL = math.radians(20.0)  # branches that differ by less are one line
+BACK = math.radians(135.0)  # nobody turns by more at a junction
+STRAIGHT_ON = math.radians(37.0)  # across a gap
+VOTES = 4  # frames that must agree before the path changes
+SURE_VOTES = 8  # the same if the path as remembered is seen as well
+SURE = 0.6  # confidence of a line that may change the path
+NEAR = 0.12  # m between the places of one junction in different frames
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Branch:
+    """A way on from arc length `s` of the remembered line; `turn` against the line's direction before it."""
+
+    s: float
+    points: Floats
+    turn: float
+    direction: float
+
+
+class Junctions:
+    """Chooses among ways on, by a rule and by what several frames agree on.
+
+    Parameters
+    ----------
+    rule : "straight", "left", "right" or "heading"
+        At forks and crossings: the way that turns least, the leftmost, the rightmost, or the one nearest to `heading`.
+    heading : float
+        Radians in odometry axes, for the rule of that name.
+    """
+
+    def __init__(self, rule: Rule, heading: float) -> None:
+        self._rule = rule
+        self._heading = heading
+        self.forget()
+
+    def forget(self) -> None:
+        """No junction is in sight."""
+        self._place: Floats = np.zeros(2)
+        self._direction = 0.0
+        self._votes = 0.0
+
+    def choose(self, line: LineMap, sights: Sequence[Sight], here: float) -> Branch | None:
+        """The branch that the line should go on with instead of its remembered rest, or None.
+
+        Parameters
+        ----------
+        line : LineMap
+            After this frame's sights were averaged in.
+        sights : sequence of Sight
+            Of this frame, in both directions.
+        here : float
+            Arc length where the robot is: nothing changes behind it.
+        """
+        if len(line) < 4:
+            return None
+        length = float(line.lengths[-1])
+        sure = [sight for sight in sights if sight.confidence >= SURE]
+        found = [branch for sight in sure if (branch := self._branch(line, sight)) is not None]
+        best: tuple[float, Branch, int] | None = None
+        for branch in found:
+            votes = VOTES
+            if branch.s < here + 0.03 or abs(branch.turn) > BACK:
+                continue
+            score = self._score(branch.turn, branch.direction)
+            own_length = length - branch.s
+            if own_length >= LEAST:
+                own = line.direction_at(branch.s + 0.04, REACH)
+                before = line.direction_at(branch.s, -0.10)
+                own_direction = math.atan2(own[1], own[0])
+                own_turn = math.atan2(before[0] * own[1] - before[1] * own[0], float(before @ own))
+                differs = abs(math.remainder(branch.direction - own_direction, 2 * math.pi)) > PARALLEL
+                beyond = (line.lengths > branch.s + 0.04) & (line.lengths < branch.s + 0.04 + REACH)
+                is_real = bool((line.missed[beyond] < VOTES).mean() > 0.5)
+                if is_real and (not differs or score > self._score(own_turn, own_direction) - 0.1):
+                    continue
+                votes = SURE_VOTES if is_real else VOTES
+            elif own_length > 2.5 * line.spacing and abs(branch.turn) < STRAIGHT_ON:
+                continue  # the end itself grows by what is seen beyond it
+            elif self._rule == "straight" and abs(branch.turn) > STRAIGHT_ON and _goes_both_ways(branch, found):
+                continue  # a line that ends at another one: there is no way straight on
+            if best is None or score < best[0]:
+                best = score, branch, votes
+        if best is None:
+            self._votes = max(0.0, self._votes - 0.5)
+            return None
+        return self._voted(line, best[1], best[2])
+
+    def _score(self, turn: float, direction: float) -> float:
+        """The smaller the better, in radians."""
+        if self._rule == "left":
+            return -turn
+        if self._rule == "right":
+            return turn
+        if self._rule == "heading":
+            return abs(math.remainder(direction - self._heading, 2 * math.pi))
+        return abs(turn)
+
+    def _voted(self, line: LineMap, branch: Branch, needed: int) -> Branch | None:
+        place = line.point_at(branch.s)
+        same = np.hypot(*(place - self._place)) < NEAR
+        same &= abs(math.remainder(branch.direction - self._direction, 2 * math.pi)) < 0.5
+        self._votes = self._votes + 1.0 if same else 1.0
+        self._place, self._direction = place, branch.direction
+        if self._votes < needed:
+            return None
+        self.forget()
+        return branch
+
+    def _branch(self, line: LineMap, sight: Sight) -> Branch | None:
+        """What of a sight leads away from the line, if anything does."""
+        lengths = line.lengths
+        found = nearest(sight.points, line.path, 0.05, lengths)
+        on = np.flatnonzero(found.on)
+        if len(on) >= 3:
+            first, s = int(on[-1]) + 1, float(found.along[on[-1]])
+        else:
+            first = int(found.gap.argmin())
+            if found.gap[first] > PASSING:
+                return None
+            away = np.hypot(*(line.path - sight.points[first]).T)
+            s = float(lengths[int(away.argmin())])
+        points = sight.points[first:]
+        if len(points) < 3 or arc_length(points)[-1] < LEAST or s < 0.05:
+            return None
+        chord = -end_direction(points[::-1], REACH)
+        before = line.direction_at(s, -0.10)
+        turn = math.atan2(before[0] * chord[1] - before[1] * chord[0], float(before @ chord))
+        return Branch(s, points, turn, math.atan2(chord[1], chord[0]))
+
+
+def _goes_both_ways(branch: Branch, found: Sequence[Branch]) -> bool:
+    return any(abs(other.s - branch.s) < NEAR and other.turn * branch.turn < 0.0 for other in found)
