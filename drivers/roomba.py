@@ -2,13 +2,13 @@
 
 The base obeys its last command for ever. So commands expire here after 0.2 s, every way out sends zero velocity,
 Passive and Stop, and only Safe mode is used, in which the base itself brakes at cliffs and dropped wheels. It leaves
-that mode without saying so; packet 35 of the sensor stream tells.
+that mode without saying so; packet 35 of the sensor stream tells. While nobody wants to move it is in Passive mode,
+because only there it charges, and an abandoned robot does not drain its battery.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -19,28 +19,32 @@ from ..bus import Bus
 from ..clock import now
 from ..config import Calibration
 from ..errors import DriverFault
-from ..hardware import Hardware, SerialLink
+from ..hardware import Hardware
 from ..plugin import Driver
 from ..records import SensorFrame
+from ..roomba.battery import BatteryWatch, charge_fraction
+from ..roomba.encoders import WheelEncoders
+from ..roomba.firmware import Firmware, keep_alive_s
+from ..roomba.line import START_S, LineCounters, RoombaLine
+from ..roomba.modes import ON_CHARGER, SETTLE_S, ModeReader, cliffs, hazards, is_charging, is_docked
+from ..roomba.slip import SlipDetector
+from ..roomba.speeds import WheelSpeeds, wheel_speeds
+from ..roomba.wake import WakeLine
 
-# bumps, cliffs, overcurrent, charging, voltage, charge, capacity, mode, encoders: 34 bytes of the 172 in a tick
-PACKETS = (7, 9, 10, 11, 12, 14, 21, 22, 25, 26, 35, 43, 44)
-PACKETS_19200 = (7, 9, 10, 11, 12, 14, 22, 35, 43, 44)  # 26 of the 28 bytes that fit at 19200 baud
-BAUDS = (115200, 19200, 57600)
-
-MAX_WHEEL_SPEED = 0.30  # m/s
 COMMAND_S = 0.2  # a drive command's life
-DITHER_S = 0.05
 SILENCE_S = 0.15
+STALLED_S = 0.2  # a line that only stalled is waited for so much longer
 LATE_S = 0.02
-START_S = 0.1  # after Start, before anything else
-FIRST_FRAMES, FIRST_FRAMES_S = 3, 0.4
-WAKE_PULSE_S, WAKE_S = 1.0, 1.0  # one long pulse, because three short ones change the baud rate
 REARM_S = 0.5
-AT_REST = 4  # frames without a count: slower than 7 mm/s
-RECOVER, RECOVER_LONG = 36, 260  # Starts that a half-received command can swallow: a song, a list of 255 packets
-CHARGING = (1, 2, 3, 4)
-MODES = {oi.OFF: "off", oi.PASSIVE: "passive", oi.SAFE: "safe", oi.FULL: "full"}
+UNDOCK_S = 5.0  # between two tries to arm on the charger, because changing modes there can freeze the robot
+TRIES = 3  # to enter Safe mode, before the numbering of the modes is learnt again and the operator told
+NEW_WISH_S = 2.0  # a wish to move after a pause of so long is a new one
+TEND_S = 1.0
+SELF_MOVED_S, SELF_MOVED = 1.0, 0.05  # s in Passive mode, m/s: nobody pushes both wheels like this for long
+TRY_AGAIN_S = 5.0  # between two tries to stop what the robot does by itself, or to reach one that does not obey
+AGAIN_S = 30.0  # until the same kind of trouble is told again
+ZERO = oi.encode("drive_direct", 0, 0)
+START, SAFE, STOP = oi.encode("start"), oi.encode("safe"), oi.encode("stop")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +54,16 @@ class RoombaConfig:
     port: str
     baud: Literal[115200, 57600, 19200] = 115200
     checksum: Literal["auto", "inclusive", "exclusive"] = "auto"
-    rearm: bool = True
+    encoders: Literal["auto", "normal", "swapped"] = "auto"
+    rearm: Literal["always", "when_clear", "never"] = "when_clear"
+    disarm_s: float = ranged(120.0, minimum=1.0, maximum=86400.0)
     speed_step: float = ranged(0.0285, minimum=0.0, maximum=0.1)
+    wake_pin: int | None = ranged(None, minimum=0, maximum=53)
+    wake_polarity: Literal["low", "high"] = "low"
+    dock_s: float = ranged(120.0, minimum=5.0, maximum=3600.0)
+    leave_dock: bool = False
+    low_charge: float = ranged(0.15, minimum=0.0, maximum=1.0)
+    low_voltage: float = ranged(13.0, minimum=0.0, maximum=20.0)
 
 
 class RoombaDriver(Driver):
@@ -59,8 +71,10 @@ class RoombaDriver(Driver):
 
     Attributes
     ----------
-    counters : robotd.oi.StreamCounters
-        Good and rejected frames since the driver was opened.
+    counters : LineCounters
+        Good, damaged, missing and late frames since the robot was found.
+    firmware : Firmware or None
+        As the robot printed it; most never do.
     """
 
     kind = "base"
@@ -69,254 +83,417 @@ class RoombaDriver(Driver):
 
     def __init__(self, name: str, config: RoombaConfig, hardware: Hardware, bus: Bus, calibration: Calibration) -> None:
         super().__init__(name, config, hardware, bus, calibration)
-        self._link: SerialLink | None = None
-        self._use_baud(config.baud)
+        self.firmware: Firmware | None = None
+        self._counters = LineCounters()
+        self._resets = 0
+        self._line: RoombaLine | None = None
+        self._warned: dict[str, float] = {}
         self._reset()
 
     def _reset(self) -> None:
+        config = self.config
         self._timer: asyncio.TimerHandle | None = None
         self._expiry = 0.0
-        self._next_arm = 0.0
-        self._mode: str | None = None
-        self._mode_offset = 0
-        # per wheel, right before left as on the wire
-        self._wanted, self._sent = [0.0, 0.0], [0.0, 0.0]  # m/s
-        self._sent_at = 0.0
-        self._owed = [0.0, 0.0]  # m
-        self._counts: tuple[int, int] | None = None
-        self._travel = [0, 0]  # counts
-        self._backward = [False, False]
-        self._still = [0, 0]  # frames
+        self._modes = ModeReader()
+        self._mode = "unknown"  # as last told
+        self._speeds = WheelSpeeds(config.speed_step)
+        self._told_mm_s = (0, 0)
+        self._encoders = WheelEncoders(config.encoders)
+        self._slip = SlipDetector()
+        self._battery = BatteryWatch(config.low_charge, config.low_voltage)
+        self._t: float | None = None  # of the last frame
+        self._values: Mapping[int, int] = {}
+        self._wish, self._wish_end = 0.0, 0.0  # last call of `arm`, and until when it counts
+        self._dropped = False  # out of Safe mode, not by us
+        self._next_arm, self._tries = 0.0, 0
+        self._blocked: str | None = None  # why it is not armed, as last told
+        self._is_docking = False
+        self._passive_t = 0.0  # since when the robot is in Passive mode
+        self._settled_t = 0.0  # from when on the mode is believed
+        self._must_learn = False  # how the modes are numbered, at that time
+        self._next_tend = self._next_pulse = self._next_try = 0.0
+
+    @property
+    def counters(self) -> LineCounters:
+        return self._line.counters if self._line is not None else self._counters
+
+    # ---- life cycle --------------------------------------------------------------------------------------------------
 
     async def open(self) -> None:
-        """Find the baud rate, enter Safe mode and start the sensor stream.
+        """Find the robot and start the sensor stream; it is in Passive mode then.
 
         Raises
         ------
         DriverFault
             No port, or nothing that looks like a sensor stream at any baud rate, also after a wake pulse.
         """
-        link = await self.hardware.open_serial(self.config.port, self.config.baud)
+        config = self.config
+        link = await self.hardware.open_serial(config.port, config.baud)
         self._reset()
-        self._link = link
-        self.resources.callback(self._leave, link)
-        await self._connect(link)
-        link.write(oi.encode("safe") + oi.encode("drive_direct", 0, 0))
-        self._next_arm = now() + REARM_S
-        self.report(f"base found on {self.config.port} at {self._baud} baud, checksum {self._decoder.checksum}")
+        self.resources.callback(link.close)
+        wake = WakeLine(link)
+        if config.wake_pin is not None:
+            wake.use_pin(self.hardware, config.wake_pin, config.wake_polarity, self.resources)
+        line = self._line = RoombaLine(link, wake, config.baud, config.checksum, self.report)
+        self.resources.callback(self._leave, line)
+        try:
+            await line.connect()
+        except DriverFault as fault:
+            raise DriverFault(f"{self.name}: {config.port}: {fault}") from fault
+        self._learn(line)
+        how = "" if line.reading is not None else "; it does not tell its mode, which is inferred from what it does"
+        self.report(f"base found on {config.port} at {line.baud} baud{how}")
 
     async def run(self) -> None:
-        """Decode the stream until cancelled; raises DriverFault when it falls silent or the port is gone."""
-        link = self._link
-        assert link is not None, "run is called after open"
+        """Decode the stream until cancelled; raises DriverFault when it stays silent or the port is gone."""
+        line = self._line
+        assert line is not None, "run is called after open"
         deadline = now() + SILENCE_S
         while True:
             try:
                 async with asyncio.timeout_at(deadline):
-                    arrived, data = await link.read()
+                    frames = await line.read()
             except TimeoutError:
                 self.halt()
                 if now() - deadline > LATE_S:  # this process was late, so frames may be waiting
                     deadline = now() + LATE_S
                     continue
-                raise DriverFault(
-                    f"{self.name}: no sensor frame on {self.config.port} for {SILENCE_S} s, halted; "
-                    "check that the robot is awake and the cable is in"
-                ) from None
-            for event in self._decoder.feed(data):
-                if isinstance(event, oi.SensorValues):
-                    deadline = arrived + SILENCE_S
-                    self._take(event, arrived)
+                await self._revive(line)
+                deadline = now() + SILENCE_S
+                continue
+            if frames:
+                deadline = line.arrived + SILENCE_S
+                self._take_all(line, frames)
+
+    def _take_all(self, line: RoombaLine, frames: list[tuple[float, Mapping[int, int]]]) -> None:
+        for t, values in frames:
+            self._take(t, values)
+        self._decide(line)
+
+    async def _revive(self, line: RoombaLine) -> None:
+        """The stream is silent: wait for a line that only stalled, ask again, wake a robot that fell asleep."""
+        since = line.arrived
+        try:
+            async with asyncio.timeout(STALLED_S):
+                while not (frames := await line.read()):
+                    pass
+            self._take_all(line, frames)
+            self._warn("stall", f"the sensor stream stalled for {now() - since:.2f} s; the robot was halted")
+            return
+        except TimeoutError:
+            pass
+        self._note_news(line)
+        may_sleep = self._modes.mode != "safe" and not self._is_docking
+        docked = is_docked(self._values)
+        if await line.greet_again():
+            self._learn(line)
+            self._warn("stop", "the sensor stream had stopped and was started again")
+            return
+        if may_sleep and await line.wake_up():
+            self._learn(line)
+            self.report(f"the robot had fallen asleep and was woken after {now() - since:.1f} s", "warning")
+            return
+        mend = "check that the robot is awake and the cable is in"
+        if may_sleep:
+            mend = "it fell asleep and does not wake: press Clean once; not every cable has the wake line, see wake_pin"
+            if docked:
+                mend = "it sleeps on the charger, where the wake line may do nothing: press Clean once or lift it off"
+        raise DriverFault(
+            f"{self.name}: no sensor frame on {self.config.port} for {now() - since:.2f} s, halted; {mend}; a robot "
+            "that stays mute answers again after its battery was out for a minute"
+        )
+
+    def _learn(self, line: RoombaLine) -> None:
+        """The robot has just been told Start."""
+        self._modes.learn(line.reading)
+        self._mode = "passive"
+        self._blocked, self._tries, self._is_docking, self._must_learn = None, 0, False, False
+        self._told_mm_s = self._speeds.command(now(), 0.0, 0.0)
+        self._passive_t = now()
+        self._note_news(line)
+        self._next_pulse = now() + keep_alive_s(self.firmware)
+
+    def _leave(self, line: RoombaLine) -> None:
+        """Zero velocity, Passive, Off; on the charger Passive, because changing modes there can freeze the robot."""
+        self._counters, self._line = line.counters, None
+        if self._timer is not None:
+            self._timer.cancel()
+        stop_program = SAFE + ZERO if self._is_docking else b""
+        if is_charging(self._values):
+            line.send(ZERO, START, oi.encode("stream"))
+        else:
+            line.send(stop_program, ZERO, START, STOP)
+
+    # ---- motion ------------------------------------------------------------------------------------------------------
 
     def drive(self, speed: float, turn_rate: float) -> None:
         """Set speed (m/s) and turn rate (rad/s, counter-clockwise) until the next command or for 0.2 s.
 
-        Both are slowed down together where a wheel would exceed 0.3 m/s. Does nothing while the base is not open.
+        Both are slowed down together where a wheel would exceed 0.3 m/s. Does nothing while the base is not open, is
+        docking, or nobody has armed it.
         """
-        if self._link is None:
+        if self._line is None or self._t is None or self._is_docking:
             return
-        half = 0.5 * turn_rate * self.calibration.wheels.base
-        right, left = speed + half, speed - half
-        factor = min(1.0, MAX_WHEEL_SPEED / max(abs(right), abs(left), 1e-9))
-        self._send_speeds(self._link, right * factor, left * factor)
+        if not (self._is_armed or any(self._told_mm_s)):
+            return
+        self._set_wheels(self._line, *wheel_speeds(speed, turn_rate, self.calibration.wheels.base))
         self._expiry = now() + COMMAND_S
         if self._timer is None:
             self._timer = asyncio.get_running_loop().call_at(self._expiry, self._expire)
 
     def halt(self) -> None:
-        """Zero velocity at once."""
-        if self._link is not None:
-            self._send_speeds(self._link, 0.0, 0.0)
+        """Zero velocity at once; also ends docking."""
+        if self._line is None or self._t is None:
+            return
+        if self._is_docking:
+            self._stop_program(self._line)
+        self._set_wheels(self._line, 0.0, 0.0)
+
+    def arm(self) -> None:
+        """Be in Safe mode, in which the wheels obey, until `disarm_s` after the last call; not while docking."""
+        if self._is_docking:
+            return
+        t = now()
+        if t - self._wish > NEW_WISH_S:
+            self._dropped, self._blocked = False, None
+        self._wish, self._wish_end = t, t + self.config.disarm_s
+        if self._line is not None and self._modes.mode != "safe" and self._t is not None:
+            self._try_to_arm(self._line)
+
+    async def dock(self) -> None:
+        """Have the robot seek its dock; returns when it charges.
+
+        Raises
+        ------
+        DriverFault
+            The base is not open or cannot drive (in words), `halt` was called, the base failed on the way, or it does
+            not charge after `dock_s`.
+        """
+        line, values = self._line, self._values
+        if line is None or self._t is None:
+            raise DriverFault(f"{self.name}: cannot dock: the base is not open")
+        if is_charging(values):
+            return
+        if self._is_docking:
+            raise DriverFault(f"{self.name}: is docking already")
+        against = hazards(values)
+        if ON_CHARGER in against:
+            raise DriverFault(f"{self.name}: it is on the charger but does not charge; clean the contacts of both")
+        if against:
+            raise DriverFault(f"{self.name}: cannot dock: {' and '.join(against)}")
+        self._set_wheels(line, 0.0, 0.0)
+        self._is_docking, self._wish_end = True, 0.0
+        self._go_passive(line, oi.encode("dock"))  # once, because a second one would pause it
+        self.report("seeking the dock")
+        try:
+            async with asyncio.timeout(self.config.dock_s):
+                while self._is_docking and self._line is line:
+                    if is_charging(self._values):
+                        self.report("docked and charging")
+                        return
+                    await asyncio.sleep(oi.TICK)
+        except TimeoutError:
+            raise DriverFault(
+                f"{self.name}: not on the charger within {self.config.dock_s:g} s; put it in front of the dock, at "
+                "most 2 m away, and check that the dock has power"
+            ) from None
+        finally:
+            if self._is_docking and self._line is line and not is_charging(self._values):
+                self._stop_program(line)
+            self._is_docking = False
+        raise DriverFault(f"{self.name}: docking was interrupted")
 
     @property
-    def counters(self) -> oi.StreamCounters:
-        return self._decoder.counters
+    def _is_armed(self) -> bool:
+        return now() < self._wish_end
 
-    def _send_speeds(self, link: SerialLink, right: float, left: float) -> None:
-        wanted = [right, left]
-        if not (right or left):
-            self._sent, self._owed = [0.0, 0.0], [0.0, 0.0]
-        elif self.config.speed_step > 0.0:
-            elapsed = min(now() - self._sent_at, COMMAND_S)
-            for wheel in range(2):
-                self._owed[wheel] += (self._wanted[wheel] - self._sent[wheel]) * elapsed
-                self._sent[wheel] = self._quantised(wheel, wanted[wheel])
-        else:
-            self._sent = wanted
-        self._wanted, self._sent_at = wanted, now()
-        with contextlib.suppress(DriverFault):  # a port that is gone also fails the reader, which reports it
-            link.write(oi.encode("drive_direct", *(round(1000.0 * speed) for speed in self._sent)))
-
-    def _quantised(self, wheel: int, wanted: float) -> float:
-        """One of the speeds that the base can do, chosen so that the wheel's travel stays as asked.
-
-        The base rounds each wheel's speed to steps of about 28.5 mm/s, which is 0.12 rad/s of turning. So the travel
-        that rounding still owes is made up for by now and then taking the next step; a step is changed only when
-        speed and debt together ask for a whole one, because the motors take some 40 ms to follow.
-        """
-        step, sent = self.config.speed_step, self._sent[wheel]
-        most = step * DITHER_S
-        self._owed[wheel] = max(-most, min(most, self._owed[wheel]))
-        due = wanted + self._owed[wheel] / DITHER_S
-        if abs(due - sent) < step:
-            return sent
-        limit = int(MAX_WHEEL_SPEED / step)
-        return max(-limit, min(limit, round(due / step))) * step
+    def _set_wheels(self, line: RoombaLine, right: float, left: float) -> None:
+        self._told_mm_s = self._speeds.command(now(), right, left)
+        line.send(oi.encode("drive_direct", *self._told_mm_s))
 
     def _expire(self) -> None:
         self._timer = None
         if now() < self._expiry:
             self._timer = asyncio.get_running_loop().call_at(self._expiry, self._expire)
-        elif any(self._sent):
-            self.halt()
+        elif any(self._told_mm_s) and self._line is not None:
+            self._set_wheels(self._line, 0.0, 0.0)
 
-    def _leave(self, link: SerialLink) -> None:
-        """Zero velocity, Passive, Off; then release the port."""
-        self._link = None
-        if self._timer is not None:
-            self._timer.cancel()
-        with contextlib.suppress(DriverFault):
-            link.write(oi.encode("drive_direct", 0, 0) + oi.encode("start") + oi.encode("stop"))
-        link.close()
-
-    # ---- connecting --------------------------------------------------------------------------------------------------
-
-    async def _connect(self, link: SerialLink) -> None:
-        bauds = (self.config.baud, *(baud for baud in BAUDS if baud != self.config.baud))
-        if await self._greet(link, self.config.baud, RECOVER):
-            return
-        link.pulse_wake(WAKE_PULSE_S)
-        await asyncio.sleep(WAKE_PULSE_S + WAKE_S)
-        for baud in bauds:
-            if await self._greet(link, baud, RECOVER_LONG):
-                return
-        raise DriverFault(
-            f"{self.name}: no sensor frame on {self.config.port} at {', '.join(map(str, bauds))} baud; check that the "
-            "robot is on (press Clean once), that the cable is in, and that RX and TX are not swapped"
-        )
-
-    def _use_baud(self, baud: int) -> None:
-        self._baud = baud
-        self._decoder = oi.StreamDecoder(PACKETS if baud > 19200 else PACKETS_19200, self.config.checksum)
-
-    async def _greet(self, link: SerialLink, baud: int, starts: int) -> bool:
-        """Try one baud rate: Passive mode, sensor stream; learn how this firmware numbers its modes."""
-        self._use_baud(baud)
-        link.set_baud(baud)
-        link.write(oi.encode("start") * starts)
-        await asyncio.sleep(START_S + starts * 10 / baud)
-        link.write(oi.encode("stream", *self._decoder.layout.packet_ids))
-        good = 0
-        try:
-            async with asyncio.timeout(FIRST_FRAMES_S):
-                while True:
-                    for event in self._decoder.feed((await link.read())[1]):
-                        if isinstance(event, oi.SensorValues):
-                            good += 1
-                            # some newer 600s report every mode one too high
-                            self._mode_offset = 1 if event.values[35] == oi.PASSIVE + 1 else 0
-                            if good >= FIRST_FRAMES:
-                                return True
-        except TimeoutError:
-            return False
+    def _stop_program(self, line: RoombaLine) -> None:
+        """End what the robot does by itself: only a change to Safe mode does."""
+        self._is_docking = False
+        self._go_passive(line, SAFE, ZERO, START)
 
     # ---- the stream --------------------------------------------------------------------------------------------------
 
-    def _take(self, event: oi.SensorValues, arrived: float) -> None:
-        values = event.values
-        self._count(values[44], values[43])
-        bits, charging = values[7], values.get(21, 0)
-        behind = self._decoder.fed - event.end + self._decoder.layout.frame_size
-        frame = SensorFrame(
-            t=arrived - behind * 10 / self._baud,
-            left=self._travel[1] * oi.COUNT,
-            right=self._travel[0] * oi.COUNT,
-            mode=MODES.get(values[35] - self._mode_offset, "unknown"),
-            bump_left=bool(bits & 2),
-            bump_right=bool(bits & 1),
-            wheel_drop_left=bool(bits & 8),
-            wheel_drop_right=bool(bits & 4),
-            cliff=bool(values[9] or values[10] or values[11] or values[12]),
-            overcurrent=bool(values[14]),
-            voltage=values[22] / 1000.0,
-            charge_fraction=_charge(values),
-        )
-        self._supervise(frame, charging in CHARGING)
-        self.bus.sensors.publish(frame)
-
-    def _count(self, right: int, left: int) -> None:
-        """Follow the encoders around their 16 bits.
-
-        The base counts one channel and takes the direction from its command: down in reverse, up when told to stand.
-        A wheel that runs out after a reverse command is therefore counted the wrong way round until it rests.
-        """
-        new = (right, left)
-        for wheel, old in enumerate(self._counts or new):
-            step = (new[wheel] - old + 0x8000) % 0x10000 - 0x8000
-            self._still[wheel] = 0 if step or self._sent[wheel] else self._still[wheel] + 1
-            if self._sent[wheel]:
-                self._backward[wheel] = self._sent[wheel] < 0
-            elif self._still[wheel] >= AT_REST:
-                self._backward[wheel] = False
-            self._travel[wheel] += -abs(step) if self._backward[wheel] else step
-        self._counts = new
-
-    def _supervise(self, frame: SensorFrame, charging: bool) -> None:
-        """Name the cause when the base leaves Safe mode, and go back to it when nothing speaks against that."""
-        if frame.mode == self._mode == "safe":
-            return
-        hazards = [
-            words
-            for present, words in (
-                (frame.wheel_drop_left, "the left wheel dropped"),
-                (frame.wheel_drop_right, "the right wheel dropped"),
-                (frame.cliff, "a cliff sensor sees no floor"),
-                (charging, "it is on the charger"),
+    def _take(self, t: float, values: Mapping[int, int]) -> None:
+        """One frame: what mode, which way, and does the floor agree?"""
+        elapsed = oi.TICK if self._t is None else t - self._t
+        self._t, self._values = t, values
+        mode = self._modes.update(t, elapsed, values, self._told_mm_s)
+        obeys = mode == "safe"
+        encoders, told = self._encoders, self._speeds.sent if obeys else (0.0, 0.0)
+        resets = encoders.resets
+        trouble = encoders.update(elapsed, values[43], values[44], self._speeds.sent, known=obeys)
+        if trouble is not None:
+            self.report(trouble, "warning")
+        self._resets += encoders.resets - resets
+        currents = (values[55], values[54]) if 55 in values else None
+        slip = self._slip.update(elapsed, told, encoders.speeds, values[14], currents, values.get(58))
+        if slip is not None and obeys:
+            self._warn("slip", f"odometry is doubtful: {slip}")
+        bits, docked = values[7], is_docked(values)
+        voltage, charge = values[22] / 1000.0, charge_fraction(values)
+        warning = self._battery.update(t, voltage, charge, charging=docked)
+        if warning is not None:
+            self.report(warning, "warning")
+        self.bus.sensors.publish(
+            SensorFrame(
+                t=t,
+                left=encoders.left,
+                right=encoders.right,
+                mode=mode,
+                bump_left=bool(bits & 2),
+                bump_right=bool(bits & 1),
+                wheel_drop_left=bool(bits & 8),
+                wheel_drop_right=bool(bits & 4),
+                cliff=bool(cliffs(values)),
+                overcurrent=bool(values[14]),
+                voltage=voltage,
+                charge_fraction=charge,
+                slipping=slip is not None or self._is_docking,
+                docked=docked,
+                charging=is_charging(values),
+                resets=self._resets,
             )
-            if present
-        ]
-        if frame.mode != self._mode:
-            if self._mode == "safe":
-                why = " and ".join(hazards) or "a button or another program"
-                self.report(f"the base left safe mode for {frame.mode} mode: {why}", "warning")
-            elif frame.mode == "safe":
-                self.report("the base is in safe mode")
-            elif hazards:
-                self.report(f"the base stays in {frame.mode} mode: {' and '.join(hazards)}", "warning")
-            self._mode = frame.mode
-        if frame.mode != "safe" and self.config.rearm and not hazards and now() >= self._next_arm:
+        )
+
+    # ---- modes -------------------------------------------------------------------------------------------------------
+
+    def _decide(self, line: RoombaLine) -> None:
+        """After a chunk of frames: which mode should the robot be in?"""
+        t, modes = now(), self._modes
+        if t >= self._next_tend:
+            self._next_tend = t + TEND_S
+            self._tend(line, t)
+        if t < self._settled_t:
+            return
+        if self._must_learn:
+            modes.learn(self._values.get(35))
+            self._must_learn = False
+        if modes.mode != self._mode:
+            self._tell_mode(modes.mode)
+        if modes.mode == "full":
+            self._renumber(line)
+        elif modes.mode == "safe" and self._slip.is_stuck and t >= self._next_try:
+            self._next_try = t + TRY_AGAIN_S
+            self._renumber(line)
+        elif self._is_armed:
+            if modes.mode != "safe":
+                self._try_to_arm(line)
+        elif modes.mode == "safe":
+            self._go_passive(line, ZERO, START)
+            self.report("nobody wants to move: in passive mode, in which the robot can charge")
+
+    def _go_passive(self, line: RoombaLine, *commands: bytes) -> None:
+        """Send commands that end in Passive mode; readings from before it do not count."""
+        t = now()
+        line.send(*commands)
+        self._modes.command(t, "passive")
+        self._mode, self._passive_t, self._settled_t = "passive", t, t + SETTLE_S
+
+    def _renumber(self, line: RoombaLine) -> None:
+        """Learn anew how this firmware numbers its modes: after Start it is in Passive mode."""
+        self._go_passive(line, ZERO, START)
+        self._must_learn = True
+        self._next_arm = self._settled_t = now() + START_S
+
+    def _tell_mode(self, mode: str) -> None:
+        """Name the cause when the base leaves Safe mode by itself."""
+        if self._mode == "safe":
+            self._dropped, self._passive_t = True, now()
             self._next_arm = now() + REARM_S
-            start = oi.encode("start") if frame.mode == "off" else b""
-            link = self._link
-            if link is not None:
-                with contextlib.suppress(DriverFault):
-                    link.write(start + oi.encode("safe") + oi.encode("drive_direct", 0, 0))
+            self._blocked = " and ".join(hazards(self._values)) or None
+            why = " and ".join(self._modes.causes(self._t or 0.0))
+            if not why:
+                why = "for an unknown reason" if 18 in self._values else "perhaps a button"
+            self.report(f"the base left safe mode for {mode} mode: {why}", "warning")
+        elif mode == "safe":
+            self.report("the base is in safe mode")
+            self._tries, self._blocked = 0, None
+        if mode == "full":
+            self.report("the base is in full mode, in which it does not brake at cliffs: refused", "error")
+        self._mode = mode
 
+    def _try_to_arm(self, line: RoombaLine) -> None:
+        """Go to Safe mode unless something speaks against it, which is told once."""
+        t = now()
+        if self._is_docking or t < max(self._next_arm, self._settled_t):
+            return
+        against = self._against_arming()
+        if against is not None:
+            if against != self._blocked:
+                self.report(f"the base stays in {self._modes.mode} mode: {against}", "warning")
+            self._blocked = against
+            return
+        self._tries += 1
+        if self._tries == TRIES + 1:
+            self.report(f"the base does not enter safe mode after {TRIES} tries; press Clean once", "warning")
+        if self._tries % (TRIES + 1) == 0 or (self._modes.is_odd and self._tries % 2):
+            self._renumber(line)
+            return
+        self._next_arm = t + (UNDOCK_S if is_docked(self._values) else REARM_S)
+        self._modes.command(t, "safe")
+        line.send(SAFE, ZERO)
 
-def _charge(values: Mapping[int, int]) -> float | None:
-    """Charge over capacity, 0..1; the charge has been seen to run below zero and wrap."""
-    capacity = values.get(26, 0)
-    if not capacity:
+    def _against_arming(self) -> str | None:
+        values, policy = self._values, self.config.rearm
+        if is_docked(values) and not self.config.leave_dock:
+            return "it is on the charger (leave_dock = false)"
+        if self._dropped and policy == "never":
+            return f'it left safe mode and rearm = "never": stop asking for motion for {NEW_WISH_S:g} s, then ask again'
+        if policy != "always":
+            found = [words for words in hazards(values) if words != ON_CHARGER]
+            return " and ".join(found) or None
         return None
-    charge = values[25] if values[25] < 0x8000 else 0
-    return min(1.0, charge / capacity)
+
+    # ---- now and then ------------------------------------------------------------------------------------------------
+
+    def _tend(self, line: RoombaLine, t: float) -> None:
+        """Once a second: keep it awake, see that it does not drive by itself, and what it said."""
+        self._note_news(line)
+        if (complaint := line.complaint()) is not None:
+            self.report(complaint, "warning")
+        if self._modes.mode == "safe" or self._is_docking:
+            self._next_pulse = t + keep_alive_s(self.firmware)
+            return
+        docked = is_docked(self._values)
+        if t >= self._next_pulse:
+            self._next_pulse = t + keep_alive_s(self.firmware)
+            line.wake.pulse()
+            if not docked:
+                line.send(START)  # because some cables have no wake line; the mode stays as it is
+        moves = min(map(abs, self._encoders.speeds)) > SELF_MOVED
+        if moves and not docked and t - self._passive_t > SELF_MOVED_S and t >= self._next_try:
+            self._next_try = t + TRY_AGAIN_S
+            self._stop_program(line)
+            self.report("the robot drove by itself (a cleaning program?) and was stopped", "warning")
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Tell of a trouble that may come again and again, once in a while."""
+        t = now()
+        if t - self._warned.get(kind, -AGAIN_S) >= AGAIN_S:
+            self._warned[kind] = t
+            self.report(text, "warning")
+
+    def _note_news(self, line: RoombaLine) -> None:
+        news, line.news = line.news, []
+        for item in news:
+            if isinstance(item, Firmware):
+                if item != self.firmware:
+                    traps = "".join(f"; {trap}" for trap in item.traps)
+                    self.report(f"the robot's firmware is {item.name}{traps}")
+                self.firmware = item
+            elif item == "reset":
+                self.report("the robot restarted by itself", "warning")
+            else:
+                self.report("the robot says that it goes to sleep", "warning")

@@ -1,10 +1,11 @@
-"""`robotd`: the daemon, the check of its configuration, and the simulated demonstration."""
+"""`robotd`: the daemon, the check of its configuration, calibration, and the simulated demonstration."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import logging
+import math
 import os
 import signal
 import sys
@@ -48,7 +49,101 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--json", action="store_true", help="print the result as one JSON object")
     demo.add_argument("--realtime", action="store_true", help="run at wall speed instead of as fast as possible")
     demo.add_argument("--record", action="store_true", help="keep every frame and every serial byte (MCAP; large)")
+    _add_sim(commands)
+    _add_calibrate(commands)
+    _add_line(commands)
     return top
+
+
+def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    devices = commands.add_parser("sim", help="one simulated device in real time").add_subparsers(
+        dest="device", required=True, metavar="DEVICE"
+    )
+    roomba = devices.add_parser("roomba", help="a simulated Roomba behind a pseudo-terminal, until SIGTERM or Ctrl-C")
+    roomba.add_argument("--link", type=Path, metavar="PATH", help="symbolic link by which clients find its serial port")
+    roomba.add_argument(
+        "--quirk", action="append", default=[], metavar="NAME[=VALUE]", help="differ from the manual; see --list-quirks"
+    )
+    roomba.add_argument(
+        "--fault", action="append", default=[], metavar="NAME=VALUE", help="fault of the line; see --list-quirks"
+    )
+    roomba.add_argument("--seed", type=_seed, default=1, help="seed of all noise (default: 1)")
+    roomba.add_argument("--store", help="drive in this store instead of on an open floor: a name or a file")
+    roomba.add_argument("--quiet", action="store_true", help="do not say what the robot does")
+    roomba.add_argument("--list-quirks", action="store_true", help="list every quirk and fault, then exit")
+
+
+def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    calibrations = commands.add_parser("calibrate", help="measure the robot").add_subparsers(
+        dest="what", required=True, metavar="WHAT"
+    )
+    odometry = calibrations.add_parser(
+        "odometry", help="wheels and base: drive and turn, and measure on the floor how far it really was"
+    )
+    odometry.add_argument(
+        "-c", "--config", type=Path, default=DEFAULT_CONFIG, help=f"configuration (default: {DEFAULT_CONFIG})"
+    )
+    odometry.add_argument("--distance", type=float, help="metres of each straight (default: 2)")
+    odometry.add_argument("--turns", type=int, help="turns of each spin (default: 5)")
+    odometry.add_argument("--repeat", type=int, help="how often each kind of run (default: 2)")
+    odometry.add_argument("--yes", action="store_true", help="do not wait for Enter before a run")
+    odometry.add_argument(
+        "--answers",
+        type=Path,
+        metavar="FILE",
+        help="read what was measured from a file or a pipe, a number a line, '#' starts a comment; implies --yes",
+    )
+
+
+def _add_line(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    line = commands.add_parser(
+        "line",
+        help="show what the line detector sees in images, videos or a camera",
+        description="Show what the line detector sees: a sheet of pictures for each image, from gradient to lines.",
+    )
+    line.add_argument(
+        "sources", nargs="+", metavar="IMAGE|VIDEO|CAMERA", help="files, or a camera: /dev/video0, or its number"
+    )
+    line.add_argument(
+        "--width-px",
+        type=_width_range,
+        metavar="MIN,MAX",
+        help="the line's width in pixels (default: any; slower, less sure)",
+    )
+    line.add_argument(
+        "--color",
+        choices=("dark", "bright", "both"),
+        default="both",
+        help="of the line against the floor; default: both",
+    )
+    line.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="look at the top view through its [floor_camera]; widths are its",
+    )
+    line.add_argument("--frames", type=_count, default=8, metavar="N", help="of a video or a camera (default: 8)")
+    line.add_argument("--out", type=Path, default=Path("out/line"), metavar="DIR", help="default: out/line")
+    line.add_argument("--stages", action="store_true", help="also write each stage as a picture of its own")
+    line.add_argument("--compare", action="store_true", help="also show what thresholds, Canny + Hough and LSD find")
+    line.add_argument("--json", action="store_true", help="print the lines as one JSON object")
+
+
+def _width_range(text: str) -> tuple[float, float]:
+    parts = text.split(",")
+    try:
+        least, greatest = (float(part) for part in parts)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected two numbers such as 12,30") from None
+    if not (math.isfinite(greatest) and 1.0 <= least <= greatest):
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected 1 <= MIN <= MAX")
+    return least, greatest
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number of 1 or more")
+    return int(text)
 
 
 def _seed(text: str) -> int:
@@ -68,6 +163,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             from .demo import demo
 
             return demo(arguments)
+        if arguments.command == "sim":
+            from .sim.terminal import run as be_roomba
+
+            return be_roomba(arguments)
+        if arguments.command == "calibrate":
+            from .calibrate import run_command
+
+            return run_command(arguments)
+        if arguments.command == "line":
+            from .line_tool import run as show_lines
+
+            return show_lines(arguments)
         return run(arguments.config, mission=arguments.mission)
     except InputError as error:
         for problem in error.problems:
@@ -123,7 +230,10 @@ def run(path: Path, *, mission: bool) -> int:
     from .real import RealHardware
 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
-    daemon = Daemon(assemble(path, RealHardware()))
+    hardware = RealHardware()
+    assembly = assemble(path, hardware)
+    hardware.guardian = path.parent / assembly.config.robot.guardian
+    daemon = Daemon(assembly)
 
     async def until_told() -> None:
         work = asyncio.ensure_future(daemon.run(mission=mission))

@@ -62,6 +62,16 @@ async def in_executor(executor: Executor | None, function: Callable[P, T], /, *a
         return await loop.run_in_executor(executor, lambda: function(*args, **kwargs))
 
 
+def stall(seconds: float) -> None:
+    """Let so much virtual time pass while nothing else runs, as while a callback computes for too long.
+
+    What was due meanwhile comes late. On an ordinary loop nothing happens: there lateness comes by itself.
+    """
+    loop = asyncio.get_running_loop()
+    if isinstance(loop, VirtualLoop):
+        loop.jump(seconds)
+
+
 class _VirtualSelector(selectors.DefaultSelector):
     """Polls the real files; when none is ready it moves the loop's clock on by the time-out instead of waiting."""
 
@@ -89,6 +99,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def time(self) -> float:
         return self._virtual.time
+
+    def jump(self, seconds: float) -> None:
+        """Move the clock on although timers are due meanwhile."""
+        self._virtual.time += seconds
 
     async def shutdown_default_executor(self, *args: Any, **kwargs: Any) -> None:
         """As on any loop, with time held: its time-out is about threads, which live in real time."""

@@ -6,13 +6,14 @@ before any device is opened.
 
 from __future__ import annotations
 
-import json
+import os
+import shutil
 import tomllib
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from .bind import bind, ranged
 from .errors import ConfigError, InputError
@@ -20,6 +21,7 @@ from .identify import IdentifyConfig
 from .odometry import Wheels
 from .records import CameraModel, KnownLabel, Priors, Rig, Sigmas, Vector3
 from .safety import SafetyLimits
+from .toml_edit import assignments, replace_table, toml
 
 T = TypeVar("T")
 
@@ -31,11 +33,18 @@ class RobotConfig:
     name: str = "robot"
     state_directory: Path = Path("/var/lib/robotd")
     calibration: Path = Path("/var/lib/robotd/calibration.toml")
+    guardian: Path = Path("/run/robotd-guardian/guardian.sock")
+    serial_log: Path | None = None
+    serial_log_mb: float = ranged(64.0, minimum=1.0, maximum=100000.0)
 
 
 @dataclass(frozen=True, slots=True)
 class MissionConfig:
-    """[mission]"""
+    """[mission]
+
+    With `stop_at` "distances" the robot stops at `stops`, metres along the line; with "markers" where it starts, then
+    at each square or dot beside the line, until the line ends or `marker_stops` stops are made.
+    """
 
     survey: str = "store"
     stops: tuple[float, ...] = ()
@@ -44,12 +53,16 @@ class MissionConfig:
     settle_s: float = ranged(0.6, minimum=0.0, maximum=10.0)
     upload_wait_s: float = ranged(60.0, minimum=0.0)
     identify: IdentifyConfig = field(default_factory=IdentifyConfig)
+    stop_at: Literal["distances", "markers"] = "distances"
+    marker_stops: int = ranged(0, minimum=0, maximum=10000)
 
     def __post_init__(self) -> None:
         if any(later <= earlier for earlier, later in zip(self.stops, self.stops[1:], strict=False)):
             raise ValueError(f"stops = {list(self.stops)}; expected increasing distances in metres")
         if self.stops and self.stops[0] < 0:
             raise ValueError(f"stops[0] = {self.stops[0]}; expected at least 0")
+        if self.stop_at == "markers" and not self.marker_stops:
+            raise ValueError("marker_stops = 0; expected with stop_at = 'markers' how many stops to make at most")
         counts = Counter(self.labels)
         twice = sorted(label for label, count in counts.items() if count > 1)
         if twice:
@@ -155,33 +168,59 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     """Write calibration.toml so that `load_calibration` reads the same values back; replaces the file atomically."""
     lines = [f"gamma = {calibration.gamma!r}", f"row_time_s = {calibration.row_time_s!r}"]
     for section in ("wheels", "priors", "sigmas"):
-        record = getattr(calibration, section)
-        lines += ["", f"[{section}]", *_assignments(record)]
-    lines += ["", "[beacons]", *(f"{json.dumps(name)} = {list(at)!r}" for name, at in calibration.beacons.items())]
+        lines += ["", f"[{section}]", *_lines(getattr(calibration, section))]
+    lines += ["", "[beacons]", *(f"{toml(name)} = {toml(at)}" for name, at in calibration.beacons.items())]
     for camera in calibration.cameras:
-        lines += ["", "[[cameras]]", *_assignments(camera)]
+        lines += ["", "[[cameras]]", *_lines(camera)]
     if calibration.floor_camera is not None:
-        lines += ["", "[floor_camera]", *_assignments(calibration.floor_camera)]
+        lines += ["", "[floor_camera]", *_lines(calibration.floor_camera)]
+    _replace(path, "\n".join(lines) + "\n")
+
+
+def save_wheels(wheels: Wheels, path: Path) -> None:
+    """Write [wheels] into calibration.toml, which need not exist; all else in it, comments too, stays as it was.
+
+    Replaces the file atomically. Raises ConfigError if the file cannot be read, or its wheels cannot be edited.
+    """
+    text = ""
+    if path.exists():
+        read_toml(path)
+        text = path.read_text(encoding="utf-8")
+    text = replace_table(text, "wheels", assignments(wheels), str(path))
+    bind(Calibration, tomllib.loads(text), str(path))
+    _replace(path, text)
+
+
+def save_floor_camera(camera: CameraModel, path: Path, note: str) -> None:
+    """Write [floor_camera] into calibration.toml, under a comment with `note`; all else in the file stays as it was.
+
+    The file need not exist and is replaced atomically. Raises ConfigError if it cannot be read or edited.
+    """
+    text = ""
+    if path.exists():
+        read_toml(path)
+        text = path.read_text(encoding="utf-8")
+    text = replace_table(text, "floor_camera", assignments(camera), str(path))
+    maker = note.split(":")[0]
+    lines = [line for line in text.splitlines() if not line.startswith(f"# {maker}:")]
+    header = next(k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[floor_camera]"))
+    lines.insert(header + 1, f"# {note}")
+    text = "\n".join(lines) + "\n"
+    bind(Calibration, tomllib.loads(text), str(path))
+    _replace(path, text)
+
+
+def _lines(record: Any) -> list[str]:
+    return [f"{key} = {value}" for key, value in assignments(record).items()]
+
+
+def _replace(path: Path, text: str) -> None:
+    path = path.resolve()  # because a link to the file must stay one
     part = path.with_name(path.name + ".part")
-    part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with part.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())  # because after a power loss a new name may stand for an empty file
+    if path.exists():
+        shutil.copymode(path, part)
     part.replace(path)
-
-
-def _assignments(record: Any) -> list[str]:
-    return [
-        f"{item.name} = {_toml(getattr(record, item.name))}"
-        for item in fields(record)
-        if getattr(record, item.name) is not None
-    ]
-
-
-def _toml(value: Any) -> str:
-    if is_dataclass(value):
-        return "{ " + ", ".join(_assignments(value)) + " }"
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int | float):
-        return repr(value)
-    return json.dumps(str(value))

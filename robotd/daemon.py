@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,22 +18,23 @@ from .bind import bind
 from .bus import Bus
 from .clock import in_thread, now, ticks
 from .config import Calibration, Config, collect, load_calibration, load_config, read_toml
+from .control import ControlLoop
 from .errors import ConfigError, DriverFault, UploadError
 from .files import map_to_json
 from .hardware import Hardware
 from .journal import Journal
 from .mission import Health, Mission, complete_map
-from .notify import notify, watchdog_s
+from .notify import notify
 from .odometry import Odometry
 from .plugin import Base, Camera, Driver, Follower, Labels, load
 from .records import Event, Map
 from .safety import SafetyGate
+from .serial_log import LoggedHardware, SerialLog
 from .upload import Uploader
 
 log = logging.getLogger("robotd")
 
 FIRST_RETRY_S, LAST_RETRY_S = 0.5, 30.0
-WATCH_S = 0.020  # the control loop's own tick, for when sensor frames stop coming
 TRAIL_S = 0.1
 LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
@@ -52,11 +53,14 @@ class Assembly:
     labels: Driver
     cameras: Mapping[str, Driver]  # the rig's, in the calibration's order
     eye: Driver  # the follower's camera
+    beacons: Driver | None = None
+    serial_log: SerialLog | None = None
 
     @property
     def drivers(self) -> list[Driver]:
         """In the order in which they are opened."""
-        return list(dict.fromkeys([self.base, *self.cameras.values(), self.eye, self.labels, self.follower]))
+        every = [self.base, *self.cameras.values(), self.eye, self.labels, self.follower, self.beacons]
+        return list(dict.fromkeys(driver for driver in every if driver is not None))
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,8 @@ def plan_drivers(path: Path, sections: Mapping[str, Any]) -> dict[str, Plan]:
             if len(names) != 1:
                 found = " and ".join(names) or "none"
                 problems.append(f"{path} [drivers]: found {found} of kind '{kind}'; expected exactly one")
+        if len(names := _of_kind(plans, "beacons")) > 1:
+            problems.append(f"{path} [drivers]: found {' and '.join(names)} of kind 'beacons'; expected one or none")
         for name in _of_kind(plans, "follower"):
             eye = str(plans[name].config.camera)
             if eye not in _of_kind(plans, "camera"):
@@ -157,6 +163,9 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
         for camera in calibration.cameras
         if camera.name not in cameras
     ]
+    serial_log = _serial_log(path, config, plans, calibration)
+    if serial_log is not None:
+        hardware = LoggedHardware(hardware, plans[_of_kind(plans, "base")[0]].config.port, serial_log)
     bus = Bus()
     drivers: dict[str, Driver] = {}
     for name, plan in plans.items() if not problems else ():
@@ -171,7 +180,27 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
     base, follower, labels = (drivers[_of_kind(plans, kind)[0]] for kind in ("base", "follower", "labels"))
     rig = {camera.name: drivers[camera.name] for camera in calibration.cameras}
     eye = drivers[str(plans[follower.name].config.camera)]
-    return Assembly(path, config, calibration, bus, hardware, base, follower, labels, rig, eye)
+    beacons = next((drivers[name] for name in _of_kind(plans, "beacons")), None)
+    return Assembly(path, config, calibration, bus, hardware, base, follower, labels, rig, eye, beacons, serial_log)
+
+
+def _serial_log(path: Path, config: Config, plans: Mapping[str, Plan], calibration: Calibration) -> SerialLog | None:
+    """The recording of the base's line that the configuration asks for, with what its replay needs."""
+    file = config.robot.serial_log
+    base = plans[_of_kind(plans, "base")[0]]
+    if file is None or not hasattr(base.config, "port"):
+        return None
+    head = {
+        "robot": config.robot.name,
+        "base": {"driver": config.drivers[base.name]["driver"], **_plain(base.config)},
+        "wheels": _plain(calibration.wheels),
+        "safety": _plain(config.safety),
+    }
+    return SerialLog(path.parent / file, round(1e6 * config.robot.serial_log_mb), head)
+
+
+def _plain(record: Any) -> dict[str, Any]:
+    return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(record).items()}
 
 
 class Supervisor:
@@ -206,58 +235,6 @@ class Supervisor:
             self.restarts += 1
 
 
-class ControlLoop:
-    """Sensor frames in, odometry and safe motion out; ticks by itself when sensor frames stop coming."""
-
-    def __init__(self, bus: Bus, base: Base, odometry: Odometry, gate: SafetyGate) -> None:
-        self.bus = bus
-        self.base = base
-        self.odometry = odometry
-        self.gate = gate
-        self.cause: str | None = "starting"
-        self._last = 0.0
-        self._command: object = None
-        self._watchdog = watchdog_s()
-        self._fed = -float("inf")
-
-    async def run(self) -> None:
-        """Until cancelled; the base is halted on the way out."""
-        try:
-            async with asyncio.TaskGroup() as group:
-                group.create_task(self._follow_sensors())
-                group.create_task(self._watch())
-        finally:
-            self.base.halt()
-
-    async def _follow_sensors(self) -> None:
-        with self.bus.sensors.subscribe(size=16) as sensors:
-            async for frame in sensors:
-                self.gate.sensors(frame)
-                self.bus.odometry.publish(self.odometry.update(frame.t, frame.left, frame.right))
-                self._steer()
-
-    async def _watch(self) -> None:
-        async for _ in ticks(WATCH_S):
-            if now() - self._last >= WATCH_S:
-                self._steer()
-
-    def _steer(self) -> None:
-        self._last = now()
-        command = self.bus.commands.latest
-        if command is not None and command is not self._command:
-            self._command = command
-            self.gate.command(command)
-        motion = self.gate.output(self._last)
-        if motion.cause is not None and motion.cause != self.cause and self.cause is None:
-            self.base.halt()
-        else:
-            self.base.drive(motion.speed, motion.turn_rate)
-        self.cause = motion.cause
-        if self._watchdog is not None and self._last - self._fed >= self._watchdog:
-            self._fed = self._last  # fed here and nowhere else: a stuck control loop must be noticed
-            notify("WATCHDOG=1")
-
-
 class Daemon:
     """One robot, running.
 
@@ -273,7 +250,9 @@ class Daemon:
         self.mission: Mission | None = None
         config, bus = assembly.config, assembly.bus
         self.odometry = Odometry(assembly.calibration.wheels)
-        self.control = ControlLoop(bus, cast(Base, assembly.base), self.odometry, SafetyGate(config.safety))
+        blind = cast(Follower, assembly.follower).blind
+        gate = SafetyGate(config.safety, assembly.calibration.wheels.base, blind)
+        self.control = ControlLoop(bus, cast(Base, assembly.base), self.odometry, gate)
         self.supervisors = [Supervisor(driver) for driver in assembly.drivers]
 
     async def run(self, *, mission: bool) -> None:
@@ -295,6 +274,8 @@ class Daemon:
                 ]
                 if uploader is not None:
                     work.append(uploader.run())
+                if assembly.serial_log is not None:
+                    work.append(assembly.serial_log.follow(assembly.bus))
                 tasks = [group.create_task(item) for item in work]
                 notify("READY=1\nSTATUS=ready")
                 if mission:
@@ -344,6 +325,7 @@ class Daemon:
             health=Health(self._fault, lambda: self.control.cause),
             wake_upload=uploader.wake if uploader is not None else lambda: None,
         )
+        self.control.resume("the mission's start")
         await mission.run()
         if uploader is not None:
             await self._fetch_map(mission, uploader, state)

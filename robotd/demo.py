@@ -33,13 +33,14 @@ from .config import save_calibration
 from .daemon import Daemon, assemble
 from .errors import InputError, RobotdError
 from .files import save_map, save_map_csv, save_survey, survey_from_json
-from .records import Map, Survey
+from .records import LinePoints, Map, Survey
 from .sim.hardware import SimHardware
 from .sim.layout import StoreLayout
 from .sim.referee import Referee
 from .sim.stores import find_store, load_store
 from .sim.world import World, WorldSettings, load_settings
 from .solver import solve
+from .solver.line_world import line_in_world, runs, save_line_csv
 from .solver.report import map_html, map_png, text_table
 
 Trail = list[tuple[float, float]]
@@ -124,9 +125,12 @@ def demo(arguments: argparse.Namespace) -> int:
             recorder = stack.enter_context(FrameRecorder(out / "recording.mcap"))
         daemon = Daemon(assemble(path, SimHardware(world, tap=recorder)))
         trail: Trail = []
-        mission_s = _run(daemon, world, trail, realtime=arguments.realtime, progress=sys.stderr)
+        line: list[LinePoints] = []
+        mission_s = _run(daemon, world, trail, line, realtime=arguments.realtime, progress=sys.stderr)
         survey = _download_survey(server, layout.name, token)
-    return _report(arguments, layout, world, daemon, survey, trail=trail, mission_s=mission_s, started=started)
+    return _report(
+        arguments, layout, world, daemon, survey, trail=trail, line=line, mission_s=mission_s, started=started
+    )
 
 
 def _fresh_folder(run: Path) -> Path:
@@ -140,7 +144,9 @@ def _fresh_folder(run: Path) -> Path:
     return run
 
 
-def _run(daemon: Daemon, world: World, trail: Trail, *, realtime: bool, progress: TextIO) -> float:
+def _run(
+    daemon: Daemon, world: World, trail: Trail, line: list[LinePoints], *, realtime: bool, progress: TextIO
+) -> float:
     """Run the daemon on the world until its mission has ended; returns seconds of mission on the loop's clock."""
 
     async def mission() -> float:
@@ -149,10 +155,12 @@ def _run(daemon: Daemon, world: World, trail: Trail, *, realtime: bool, progress
                 group.create_task(world.run()),
                 group.create_task(_show_progress(daemon.assembly.bus, progress)),
                 group.create_task(_keep_trail(daemon.assembly.bus, trail)),
+                group.create_task(_keep_line(daemon.assembly.bus, line)),
             ]
             begun = asyncio.get_running_loop().time()
             await daemon.run(mission=True)
             elapsed = asyncio.get_running_loop().time() - begun
+            await asyncio.sleep(0.0)  # so that what closing published is taken too
             for task in background:
                 task.cancel()
         return elapsed
@@ -166,6 +174,13 @@ async def _keep_trail(bus: Bus, trail: Trail) -> None:
         state = bus.odometry.latest
         if state is not None and (not trail or trail[-1] != (state.pose.x, state.pose.y)):
             trail.append((state.pose.x, state.pose.y))
+
+
+async def _keep_line(bus: Bus, line: list[LinePoints]) -> None:
+    """Keep the line as the follower saw it, for the picture."""
+    with bus.line_points.subscribe() as pieces:
+        async for piece in pieces:
+            line.append(piece)
 
 
 async def _show_progress(bus: Bus, out: TextIO) -> None:
@@ -278,6 +293,7 @@ def _report(
     survey: Survey | None,
     *,
     trail: Trail,
+    line: list[LinePoints],
     mission_s: float,
     started: float,
 ) -> int:
@@ -295,8 +311,12 @@ def _report(
     save_map(solved, out / "map.json")
     save_map_csv(solved, out / "map.csv")
     outline = referee.outline()
-    map_png(out / "map.png", solved, survey=survey, truth=truth, outline=outline, trail=trail)
-    map_html(out / "map.html", solved, survey=survey, truth=truth, outline3d=referee.outline3d())
+    distances = [at - layout.line.stops[0] for at in layout.line.stops]
+    on_floor = line_in_world(line, solved, survey, distances)
+    save_line_csv(out / "line.csv", on_floor)
+    pieces = runs(on_floor)
+    map_png(out / "map.png", solved, survey=survey, truth=truth, outline=outline, trail=trail, line=pieces)
+    map_html(out / "map.html", solved, survey=survey, truth=truth, outline3d=referee.outline3d(), line=pieces)
     wall_s = time.monotonic() - started
     peak_mb = _peak_mb()
     result = {

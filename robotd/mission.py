@@ -11,6 +11,7 @@ stops it made, and the map says of each label without a position why it has none
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
@@ -27,8 +28,8 @@ from .hardware import CameraMode, Hardware
 from .identify import Identifier, Slot
 from .journal import Journal
 from .odometry import Odometry
-from .plugin import Base, Camera, Follower, Labels
-from .records import Event, Frame, Map, MappedLabel, MissionStatus, Pose, Sighting, Stop, Survey
+from .plugin import Base, Camera, FollowEnd, Follower, Labels
+from .records import Event, Frame, Map, MappedLabel, MissionStatus, Pose, Sighting, Stop, Survey, Withdrawal
 
 T = TypeVar("T")
 State = Literal["idle", "driving", "settling", "observing", "uploading", "paused", "fault", "done"]
@@ -118,15 +119,17 @@ class Mission:
         with ThreadPoolExecutor(max_workers=max(1, len(self.cameras)), thread_name_prefix="blink") as self._workers:
             try:
                 await self._ready()
-                for number, distance in enumerate(config.stops, 1):
-                    target = distance - config.stops[0]
-                    await self._through_faults("driving", number, partial(self._drive, target))
+                for number in range(1, self._most_stops + 1):
+                    if await self._through_faults("driving", number, partial(self._drive, number)) == "end":
+                        text = f"the line ended after stop {number - 1}: all its markers are made"
+                        self.bus.events.publish(Event(now(), "mission", "info", text))
+                        break
                     await self._through_faults("settling", number, self._settle)
                     sightings = await self._through_faults("observing", number, self._observe)
                     await self._record(number, sightings)
             except MissionError as error:
                 self.ended = str(error)
-                self.base.halt()
+                self._halt(self.ended)
                 self._status("fault", len(self.stops) + 1, self.ended)
                 self.bus.events.publish(Event(now(), "mission", "error", self.ended))
         self._status("uploading", len(self.stops))
@@ -142,20 +145,27 @@ class Mission:
                 raise MissionError(fault or f"{self.base.name}: no sensor frame for {FAULT_WAIT_S:g} s")
             await asyncio.sleep(0.05)
 
-    async def _drive(self, target: float) -> None:
-        state = self.bus.odometry.latest
+    async def _drive(self, number: int) -> FollowEnd | None:
+        """To the stop of that number; what ended the drive, or None if the robot is there already."""
+        config, state = self.config, self.bus.odometry.latest
+        at_marker = config.stop_at == "markers"
+        if at_marker:
+            target = math.inf if number > 1 else 0.0
+        else:
+            target = config.stops[number - 1] - config.stops[0]
         if state is not None and state.travelled >= target - 0.001:
-            return
-        await self.eye.start(CameraMode(size=self._eye_size(), fps=30.0, exposure=0.010))
+            return None
+        await self.eye.start(self.follower.mode)
         try:
-            await self.follower.follow(target)
+            return await (self.follower.follow(target, at_marker=True) if at_marker else self.follower.follow(target))
         finally:
             self.base.halt()
             await self.eye.stop()
 
-    def _eye_size(self) -> tuple[int, int]:
-        camera = self.calibration.floor_camera
-        return camera.size if camera is not None else (320, 240)
+    @property
+    def _most_stops(self) -> int:
+        config = self.config
+        return config.marker_stops if config.stop_at == "markers" else len(config.stops)
 
     async def _settle(self) -> None:
         quiet = now()
@@ -223,7 +233,7 @@ class Mission:
         self.stops.append(stop)
         self.wake_upload()
         seen = len({sighting.label for sighting in sightings})
-        text = f"stop {number} of {len(self.config.stops)}: {seen} labels, {len(sightings)} sightings"
+        text = f"stop {number} of {self._most_stops}: {seen} labels, {len(sightings)} sightings"
         self.bus.events.publish(Event(now(), "mission", "info", text))
 
     # ---- faults ------------------------------------------------------------------------------------------------------
@@ -239,9 +249,14 @@ class Mission:
             try:
                 return await _first(step(), self._trouble(driving=state == "driving"))
             except DriverFault as fault:
-                self.base.halt()
+                self._halt(str(fault))
                 self._status("paused", stop, str(fault))
                 await self._wait_healthy(str(fault))
+
+    def _halt(self, cause: str) -> None:
+        """Zero velocity at once, and the follower's wish to move no longer counts."""
+        self.base.halt()
+        self.bus.withdrawals.publish(Withdrawal(now(), self.follower.name, cause))
 
     async def _trouble(self, *, driving: bool) -> Any:
         """Never returns; raises DriverFault when a device fails, MissionError when the wheels are held for HELD_S."""
@@ -266,7 +281,7 @@ class Mission:
     # ---- words -------------------------------------------------------------------------------------------------------
 
     def _status(self, state: State, stop: int, text: str = "") -> None:
-        self.bus.status.publish(MissionStatus(now(), state, stop, len(self.config.stops), text))
+        self.bus.status.publish(MissionStatus(now(), state, stop, self._most_stops, text))
 
     def _utc(self) -> str:
         return self.hardware.utc().astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

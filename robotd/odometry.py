@@ -1,19 +1,31 @@
 """Dead reckoning from wheel travel, and how far it can be trusted.
 
 Each wheel's true travel is taken to be its encoder's travel plus a random walk whose variance grows with the distance
-rolled, independently of the other wheel. The covariance of a move is that noise carried along the driven path: an
-early error of heading sweeps the whole rest of the path sideways.
+rolled, independently of the other wheel. An early error of heading sweeps the whole rest of the path sideways:
+`path_error` carries that along. Two statements come of it.
+
+* A move's covariance in a survey holds what is new in each move: the random walk, the encoders' quantisation, and the
+  stretches in which the base itself reports slipping. The solver treats the rest on its own: it estimates scale and
+  turn factors of a whole leg under priors, and gives moves a robust loss because wheels slip.
+* The total covariance, of a move or of the pose since the start, holds that and all else that makes the reckoned pose
+  wrong: the uncertainty of the calibration, which is the same error in every move, and slips that nobody notices.
+
+Both are second moments of the error about the reckoned pose; slips always shorten the way, so its mean is not zero.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections import deque
 from dataclasses import dataclass
 
+import numpy as np
+
 from .bind import ranged
 from .geometry.transforms import wrap_angle
 from .oi import COUNT
+from .path_error import CalibrationError, PathError, as_matrix3
 from .records import Matrix3, Move, OdometryState, Pose
 
 SPEED_WINDOW = 0.12  # s: one count in one 15 ms tick is 30 mm/s, over this window it is 4 mm/s
@@ -21,18 +33,47 @@ MAX_WHEEL_SPEED = 1.0  # m/s: twice what the base can do
 MAX_GAP = 0.5  # s: after a longer silence the counts need not continue the old ones
 
 
+WHEEL_BASE = 0.235  # m, Create 2 Open Interface 2016, packet 20
+
+
+def calibration_covariance(scale_sigma: float, base_sigma: float) -> Matrix3:
+    """Covariance of scale_left, scale_right and base: one error common to both scales, and one of the base in metres.
+
+    For wheels that are alike. `robotd calibrate odometry` writes the covariance of what it measured instead.
+    """
+    scale, base = scale_sigma * scale_sigma, base_sigma * base_sigma
+    return (scale, scale, 0.0), (scale, scale, 0.0), (0.0, 0.0, base)
+
+
+CALIBRATED = calibration_covariance(0.003, 0.003 * WHEEL_BASE)
+
+
 @dataclass(frozen=True, slots=True)
 class Wheels:
-    """[wheels] of the calibration: what turns encoder counts into motion.
+    """[wheels] of the calibration: what turns encoder counts into motion, and how well it is known.
 
     `scale_left` and `scale_right` are true over nominal travel, `base` is the distance between the wheels in metres,
     `travel_noise` the standard deviation of a wheel's travel after one metre (metres per square root of a metre).
+    `covariance` is that of (scale_left, scale_right, base in metres), by default 0.3 % of the size of both wheels and
+    of the base. A wheel slips once in `slip_distance` metres (0: never) and then turns for `slip_length` metres in
+    vain.
     """
 
     scale_left: float = ranged(1.0, minimum=0.5, maximum=2.0)
     scale_right: float = ranged(1.0, minimum=0.5, maximum=2.0)
-    base: float = ranged(0.235, minimum=0.05, maximum=1.0)
+    base: float = ranged(WHEEL_BASE, minimum=0.05, maximum=1.0)
     travel_noise: float = ranged(0.003, minimum=0.0, maximum=0.1)
+    covariance: Matrix3 = CALIBRATED
+    slip_length: float = ranged(0.03, minimum=0.0, maximum=1.0)
+    slip_distance: float = ranged(20.0, minimum=0.0, maximum=1e6)
+
+    def __post_init__(self) -> None:
+        S = np.array(self.covariance)
+        if not np.allclose(S, S.T, rtol=1e-6, atol=0.0) or np.linalg.eigvalsh(S)[0] < -1e-9 * np.trace(S):
+            raise ValueError(
+                "covariance: expected a symmetric 3x3 matrix without negative eigenvalues: the covariance of "
+                "scale_left, scale_right and base"
+            )
 
 
 def arc(left: float, right: float, base: float) -> tuple[float, float, float]:
@@ -47,54 +88,42 @@ def arc(left: float, right: float, base: float) -> tuple[float, float, float]:
 
 
 class _Path:
-    """Motion since some instant in the axes of that instant, heading unwrapped, with its covariance (6 entries)."""
+    """Motion since some instant in the axes of that instant, heading unwrapped, with the moments of its error.
 
-    def __init__(self) -> None:
-        self.x = self.y = self.heading = 0.0
-        self.xx = self.xy = self.xh = self.yy = self.yh = self.hh = 0.0
+    `noise` says whether those without calibration and slips are wanted too.
+    """
+
+    def __init__(self, wheels: Wheels, *, noise: bool) -> None:
+        self.wheels = wheels
+        self.at = complex(0.0)
+        self.heading = 0.0
         self.broken = False
+        self._noise = PathError(wheels, slips=False) if noise else None
+        self._all = PathError(wheels, slips=True)
+        self._calibration = CalibrationError(wheels)
 
-    def add(self, left: float, right: float, wheels: Wheels) -> None:
-        """Append one step of wheel travel.
-
-        First-order propagation P' = F P F^T + G Q G^T: F is the derivative of the step by the pose before it, G by
-        the two wheels' travels (evaluated at mid-angle), Q = travel_noise^2 diag(|left|, |right|).
-        """
-        forward, sideways, turn = arc(left, right, wheels.base)
-        c, s = math.cos(self.heading), math.sin(self.heading)
-        dx, dy = c * forward - s * sideways, s * forward + c * sideways
-        # F: an error of heading shifts the end of the step at right angles to it
-        self.xx += -2.0 * dy * self.xh + dy * dy * self.hh
-        self.xy += dx * self.xh - dy * self.yh - dx * dy * self.hh
-        self.yy += 2.0 * dx * self.yh + dx * dx * self.hh
-        self.xh -= dy * self.hh
-        self.yh += dx * self.hh
-        # G: columns for the left and the right wheel
-        middle = self.heading + 0.5 * turn
-        along_x, along_y = 0.5 * math.cos(middle), 0.5 * math.sin(middle)
-        across_x, across_y = 0.5 * dy / wheels.base, 0.5 * dx / wheels.base
-        for sign, rolled in ((-1.0, abs(left)), (1.0, abs(right))):
-            q = wheels.travel_noise * wheels.travel_noise * rolled
-            gx, gy, gh = along_x - sign * across_x, along_y + sign * across_y, sign / wheels.base
-            self.xx += q * gx * gx
-            self.xy += q * gx * gy
-            self.xh += q * gx * gh
-            self.yy += q * gy * gy
-            self.yh += q * gy * gh
-            self.hh += q * gh * gh
-        self.x += dx
-        self.y += dy
+    def add(self, left: float, right: float, slipping: bool) -> None:
+        """Append one step of wheel travel."""
+        forward, sideways, turn = arc(left, right, self.wheels.base)
+        step = cmath.rect(1.0, self.heading) * complex(forward, sideways)
+        along = cmath.rect(1.0, self.heading + 0.5 * turn)
+        if self._noise is not None:
+            self._noise.add(step, along, left, right, slipping)
+        self._all.add(step, along, left, right, slipping)
+        self._calibration.add(step, along, left, right)
+        self.at += step
         self.heading += turn
 
-    def covariance(self, base: float) -> Matrix3:
+    def covariance(self, *, total: bool) -> Matrix3:
         """With the encoders' quantisation at both ends, which also keeps it positive definite after no motion."""
         count = COUNT * COUNT / 6.0  # variance of the difference of two roundings to whole counts, one wheel
-        position, heading = 0.5 * count, 2.0 * count / (base * base)
-        return (
-            (self.xx + position, self.xy, self.xh),
-            (self.xy, self.yy + position, self.yh),
-            (self.xh, self.yh, self.hh + heading),
-        )
+        moment = np.diag([0.5 * count, 0.5 * count, 2.0 * count / (self.wheels.base * self.wheels.base)])
+        if total or self._noise is None:
+            moment += self._all.second_moment()
+            moment += self._calibration.second_moment()
+        else:
+            moment += self._noise.second_moment()
+        return as_matrix3(moment)
 
 
 class Odometry:
@@ -114,9 +143,11 @@ class Odometry:
     def __init__(self, wheels: Wheels) -> None:
         self.wheels = wheels
         self.resets = 0
+        self._base_resets: int | None = None
         self._pose = Pose(0.0, 0.0, 0.0)
         self._travelled = 0.0
-        self._move = _Path()
+        self._whole = _Path(wheels, noise=False)
+        self._move = _Path(wheels, noise=True)
         self._last: tuple[float, float, float] | None = None
         self._recent: deque[tuple[float, float, float]] = deque()
 
@@ -125,7 +156,9 @@ class Odometry:
         """Whether a reset happened since the mark: then the move lacks an unknown motion, and the leg ends here."""
         return self._move.broken
 
-    def update(self, t: float, left: float, right: float) -> OdometryState:
+    def update(
+        self, t: float, left: float, right: float, slipping: bool = False, resets: int | None = None
+    ) -> OdometryState:
         """Take the wheels' travel at time `t` and return where the robot is.
 
         Parameters
@@ -134,36 +167,48 @@ class Odometry:
             Seconds; not before the last update.
         left, right : float
             Nominal metres rolled by each wheel since any fixed instant, forward positive, as in SensorFrame.
+        slipping : bool, optional
+            The base reports that wheels and floor disagree: an unknown share of the travel moves nothing.
+        resets : int, optional
+            How often the base says that its wheel travel was interrupted, as in SensorFrame.
         """
         if self._last is not None:
             last_t, last_left, last_right = self._last
             step_left, step_right, elapsed = left - last_left, right - last_right, t - last_t
             farthest = 0.02 + MAX_WHEEL_SPEED * max(0.0, elapsed)
-            if elapsed > MAX_GAP or max(abs(step_left), abs(step_right)) > farthest:
+            interrupted = resets != self._base_resets
+            if interrupted or elapsed > MAX_GAP or max(abs(step_left), abs(step_right)) > farthest:
                 self.resets += 1
                 self._move.broken = True
                 self._recent.clear()
             elif step_left or step_right:
-                self._roll(step_left * self.wheels.scale_left, step_right * self.wheels.scale_right)
+                self._roll(step_left * self.wheels.scale_left, step_right * self.wheels.scale_right, slipping)
         self._last = (t, left, right)
+        self._base_resets = resets
         speed, turn_rate = self._rates(self._last)
         return OdometryState(t, self._pose, self._travelled, speed, turn_rate)
 
     def mark(self) -> None:
         """Start a new move here."""
-        self._move = _Path()
+        self._move = _Path(self.wheels, noise=True)
 
-    def move_since_mark(self) -> Move:
+    def move_since_mark(self, *, total: bool = False) -> Move:
         """Motion since the mark (or construction) in the axes of the robot at the mark, with its covariance.
 
-        The covariance is positive definite; it does not contain errors that last for a whole leg (scales, base) nor
-        slips, which the solver treats on its own.
+        By default the covariance is the one for a survey: it contains neither errors that last for a whole leg (scales,
+        base) nor slips that nobody notices, which the solver treats on its own. With `total` it contains these too;
+        the calibration's part is then the same error in every move. Either is positive definite.
         """
         move = self._move
-        return Move(move.x, move.y, wrap_angle(move.heading), move.covariance(self.wheels.base))
+        return Move(move.at.real, move.at.imag, wrap_angle(move.heading), move.covariance(total=total))
 
-    def _roll(self, left: float, right: float) -> None:
-        self._move.add(left, right, self.wheels)
+    def pose_covariance(self) -> Matrix3:
+        """Total covariance of the pose (x, y, heading) since construction; what resets hide is not in it."""
+        return self._whole.covariance(total=True)
+
+    def _roll(self, left: float, right: float, slipping: bool) -> None:
+        self._whole.add(left, right, slipping)
+        self._move.add(left, right, slipping)
         forward, sideways, turn = arc(left, right, self.wheels.base)
         pose = self._pose
         c, s = math.cos(pose.heading), math.sin(pose.heading)

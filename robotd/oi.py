@@ -18,6 +18,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from .oi_packets import GROUPS as GROUPS
+from .oi_packets import PACKETS as PACKETS
+from .oi_packets import Packet as Packet
+from .oi_packets import decode_values as decode_values
+from .oi_packets import encode_values as encode_values
+from .oi_packets import members as members
+from .oi_packets import packet_struct
+
 HEADER = 19
 TICK = 0.015  # s between two updates of the robot's sensor values
 COUNT = 0.000444565  # m of wheel travel per encoder count (packets 43, 44): pi * 72.0 mm / 508.8
@@ -27,127 +35,7 @@ BAUD_CODES = (300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 5760
 STRAIGHT, STRAIGHT_TOO, SPIN_CLOCKWISE, SPIN_COUNTER_CLOCKWISE = -0x8000, 0x7FFF, -1, 1  # radius codes of opcode 137
 
 Checksum = Literal["inclusive", "exclusive", "auto"]
-
-
-# ---- sensor packets --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Packet:
-    """One sensor packet; `code` is the struct code of its value (B, b, H, h)."""
-
-    id: int
-    name: str
-    code: str
-
-    @property
-    def size(self) -> int:
-        """Bytes on the wire."""
-        return struct.calcsize(self.code)
-
-
-_PACKETS = (
-    (7, "bumps_wheel_drops", "B"),
-    (8, "wall", "B"),
-    (9, "cliff_left", "B"),
-    (10, "cliff_front_left", "B"),
-    (11, "cliff_front_right", "B"),
-    (12, "cliff_right", "B"),
-    (13, "virtual_wall", "B"),
-    (14, "overcurrent", "B"),
-    (15, "dirt", "B"),
-    (16, "unused_16", "B"),
-    (17, "ir_omni", "B"),
-    (18, "buttons", "B"),
-    (19, "distance_mm", "h"),
-    (20, "angle_deg", "h"),
-    (21, "charging_state", "B"),
-    (22, "voltage_mv", "H"),
-    (23, "current_ma", "h"),
-    (24, "temperature_c", "b"),
-    (25, "charge_mah", "H"),
-    (26, "capacity_mah", "H"),
-    (27, "wall_signal", "H"),
-    (28, "cliff_left_signal", "H"),
-    (29, "cliff_front_left_signal", "H"),
-    (30, "cliff_front_right_signal", "H"),
-    (31, "cliff_right_signal", "H"),
-    (32, "unused_32", "B"),
-    (33, "unused_33", "H"),
-    (34, "charging_sources", "B"),
-    (35, "mode", "B"),
-    (36, "song_number", "B"),
-    (37, "song_playing", "B"),
-    (38, "stream_packets", "B"),
-    (39, "requested_velocity_mm_s", "h"),
-    (40, "requested_radius_mm", "h"),
-    (41, "requested_right_mm_s", "h"),
-    (42, "requested_left_mm_s", "h"),
-    (43, "left_encoder", "H"),  # signed in one manual, unsigned in the other: a count modulo 65536
-    (44, "right_encoder", "H"),
-    (45, "light_bumper", "B"),
-    (46, "light_left_signal", "H"),
-    (47, "light_front_left_signal", "H"),
-    (48, "light_centre_left_signal", "H"),
-    (49, "light_centre_right_signal", "H"),
-    (50, "light_front_right_signal", "H"),
-    (51, "light_right_signal", "H"),
-    (52, "ir_left", "B"),
-    (53, "ir_right", "B"),
-    (54, "left_wheel_ma", "h"),
-    (55, "right_wheel_ma", "h"),
-    (56, "main_brush_ma", "h"),
-    (57, "side_brush_ma", "h"),
-    (58, "stasis", "B"),
-)
-PACKETS = {number: Packet(number, name, code) for number, name, code in _PACKETS}
-
-
-def _span(first: int, last: int) -> tuple[int, ...]:
-    return tuple(range(first, last + 1))
-
-
-GROUPS: dict[int, tuple[int, ...]] = {
-    0: _span(7, 26),
-    1: _span(7, 16),
-    2: _span(17, 20),
-    3: _span(21, 26),
-    4: _span(27, 34),
-    5: _span(35, 42),
-    6: _span(7, 42),
-    100: _span(7, 58),
-    101: _span(43, 58),
-    106: _span(46, 51),
-    107: _span(54, 58),
-}
-
-
-def members(packet_id: int) -> tuple[int, ...]:
-    """The packets that an id stands for: itself, or those of a group. Raises ValueError for an unknown id."""
-    if packet_id in PACKETS:
-        return (packet_id,)
-    if packet_id in GROUPS:
-        return GROUPS[packet_id]
-    raise ValueError(f"sensor packet {packet_id} does not exist; expected 7 to 58 or a group {sorted(GROUPS)}")
-
-
-def _struct(packet_ids: Sequence[int]) -> struct.Struct:
-    return struct.Struct(">" + "".join(PACKETS[member].code for number in packet_ids for member in members(number)))
-
-
-def encode_values(packet_ids: Sequence[int], values: Mapping[int, int]) -> bytes:
-    """The robot's answer to a query (opcodes 142, 149): the data bytes alone, without ids and checksum."""
-    flat = [values[member] for number in packet_ids for member in members(number)]
-    return _struct(packet_ids).pack(*flat)
-
-
-def decode_values(packet_ids: Sequence[int], data: bytes) -> dict[int, int]:
-    """Values by packet id from a query's answer; raises ValueError if its length is not what was asked for."""
-    layout = _struct(packet_ids)
-    if len(data) != layout.size:
-        raise ValueError(f"got {len(data)} bytes for the packets {list(packet_ids)}; expected {layout.size}")
-    keys = [member for number in packet_ids for member in members(number)]
-    return dict(zip(keys, layout.unpack(data), strict=True))
+_KINDS = ("inclusive", "exclusive")
 
 
 # ---- stream frames ---------------------------------------------------------------------------------------------------
@@ -163,7 +51,11 @@ class SensorValues:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """Bytes that belong to no frame or command; `reason` is "noise", "length", "order", "checksum" or "opcode"."""
+    """Bytes that belong to no frame or command.
+
+    `reason` says why the first of them was not taken for a header or an opcode: "noise" (it is no header), "length",
+    "order", "checksum", "ambiguous" (see StreamDecoder) or "opcode".
+    """
 
     data: bytes
     reason: str
@@ -177,6 +69,7 @@ class StreamCounters:
     bad_length: int = 0
     bad_order: int = 0
     bad_checksum: int = 0
+    ambiguous: int = 0
     skipped_bytes: int = 0
 
 
@@ -187,19 +80,38 @@ class StreamLayout:
     ----------
     packet_ids : sequence of int
         Ids as in opcode 148; groups are allowed.
+
+    Attributes
+    ----------
+    keys : tuple of int
+        The packets, groups taken apart.
+    length, frame_size : int
+        N, and N + 3: bytes of a whole frame.
+    lookalikes : tuple of int
+        Offsets in bytes at which a frame's data can look like the start of a frame, so that the bytes from there to
+        the same place in the next frame have header, length and ids where they belong. Most layouts have none,
+        because at every offset some id would have to stand where another one stands.
     """
 
     def __init__(self, packet_ids: Sequence[int]) -> None:
         self.packet_ids = tuple(packet_ids)
         self.keys = tuple(member for number in packet_ids for member in members(number))
-        sizes = [_struct([number]).size for number in packet_ids]
-        self.length = sum(sizes) + len(sizes)  # N
-        self.frame_size = self.length + 3
+        sizes = [packet_struct([number]).size for number in packet_ids]
+        self.length = sum(sizes) + len(sizes)
+        self.frame_size = size = self.length + 3
         if not 0 < self.length < 256:
             raise ValueError(f"a frame of {len(sizes)} packets would hold {self.length} bytes; expected 1 to 255")
-        self._ids = struct.Struct(">" + "".join(f"B{size}x" for size in sizes))
-        self._values = struct.Struct(">" + "".join("x" + _struct([n]).format.lstrip(">") for n in packet_ids))
-        self._pieces = [(bytes([number]), _struct([number]), len(members(number))) for number in packet_ids]
+        self._pieces = [(bytes([number]), packet_struct([number]), len(members(number))) for number in packet_ids]
+        self._values = struct.Struct(">2x" + "".join(f"x{layout.format[1:]}" for _, layout, _ in self._pieces) + "x")
+        starts = [2 + sum(sizes[:place]) + place for place in range(len(sizes))]
+        fixed = {0: HEADER, 1: self.length, **dict(zip(starts, self.packet_ids, strict=True))}
+        self.lookalikes = tuple(
+            offset
+            for offset in range(1, size)
+            if all(fixed.get((place + offset) % size, value) == value for place, value in fixed.items())
+        )
+        self._fixed = sum(value << 8 * (size - 1 - place) for place, value in fixed.items())
+        self._mask = sum(0xFF << 8 * (size - 1 - place) for place in fixed)
 
     def encode(self, values: Sequence[int], checksum: Checksum = "inclusive") -> bytes:
         """One frame from the values in the order of `keys`."""
@@ -213,13 +125,13 @@ class StreamLayout:
         total = sum(body) - (HEADER if checksum == "exclusive" else 0)
         return body + bytes((-total & 0xFF,))
 
-    def has_ids(self, payload: bytes) -> bool:
-        """Whether the ids stand in a payload (the bytes between N and the checksum) where they should."""
-        return self._ids.unpack(payload) == self.packet_ids
+    def is_framed(self, frame: bytes) -> bool:
+        """Whether header, length and ids stand where they should in `frame_size` bytes."""
+        return int.from_bytes(frame) & self._mask == self._fixed
 
-    def decode(self, payload: bytes) -> dict[int, int]:
-        """Values by packet id."""
-        return dict(zip(self.keys, self._values.unpack(payload), strict=True))
+    def decode(self, frame: bytes) -> dict[int, int]:
+        """Values by packet id of a whole frame."""
+        return dict(zip(self.keys, self._values.unpack(frame), strict=False))  # they are as many; strict takes longer
 
 
 def encode_stream_frame(
@@ -232,6 +144,15 @@ def encode_stream_frame(
 
 class StreamDecoder:
     """Finds the frames of one known stream among any bytes.
+
+    What it guarantees: while the robot's frames follow one another unbroken, no other bytes are ever taken for a
+    frame, whatever the values and wherever in the stream it began to listen. A window that is not a frame then spans
+    two of them. If the layout has no `lookalikes` such a window never has its ids in order. If it has some, a
+    candidate that does not stand where the last frame ended must have no rival: if one that overlaps it is as good,
+    both are refused as "ambiguous" until the data changes, because in equal frames nothing tells them apart.
+
+    What it cannot know: where bytes were lost, added or changed on the line a window may pass by chance. Its ids must
+    then still be in order, and of the windows that pass that test the 8-bit sum lets through one in 256.
 
     Parameters
     ----------
@@ -261,7 +182,8 @@ class StreamDecoder:
         self._buffer = bytearray()
         self._run = bytearray()
         self._reason = "noise"
-        self._agreed: tuple[Checksum, int] = (checksum, 0)
+        self._agreed: tuple[str, int] = (checksum, 0)
+        self._next = -1  # where the last frame, good or with a bad sum, ended, in bytes fed
 
     @property
     def pending(self) -> bytes:
@@ -276,51 +198,82 @@ class StreamDecoder:
         buffer += data
         size, length = self.layout.frame_size, self.layout.length
         start, end = 0, len(buffer)
+        begin = self.fed - end
         while start < end:
-            header = buffer.find(HEADER, start)
-            if header != start:
+            if buffer[start] != HEADER:
+                header = buffer.find(HEADER, start)
                 stop = header if header >= 0 else end
                 self._skip(bytes(buffer[start:stop]), events)
                 start = stop
                 continue
             if end - start < 2:
                 break
-            reason: str | None = "length"
+            verdict = "length"
             if buffer[start + 1] == length:
                 if end - start < size:
                     break
                 frame = bytes(buffer[start : start + size])
-                reason = self._fault(frame)
-                if reason is None:
-                    self._end_run(events)
+                verdict = self._verdict(frame)
+                is_next = begin + start == self._next
+                if verdict in _KINDS and self.layout.lookalikes and not is_next:
+                    verdict = self._weighed(verdict, bytes(buffer[start : start + 2 * size]))
+                    if verdict == "wait":
+                        break
+                if verdict in _KINDS:
                     start += size
+                    self._next = begin + start
                     self.counters.frames += 1
-                    events.append(SensorValues(self.layout.decode(frame[2:-1]), self.fed - end + start))
+                    if self.checksum == "auto":
+                        self._count_kind(verdict)
+                    if self._run:
+                        self._end_run(events)
+                    events.append(SensorValues(self.layout.decode(frame), begin + start))
                     continue
-            self._reject(reason or "", events)
+                if verdict == "checksum" and is_next:
+                    self._next += size
+            self._reject(verdict, events)
             start += 1
         del buffer[:start]
         return events
 
-    def _fault(self, frame: bytes) -> str | None:
-        if not self.layout.has_ids(frame[2:-1]):
-            self.counters.bad_order += 1
+    def _verdict(self, frame: bytes) -> str:
+        """The kind of checksum of a good frame, otherwise what is wrong with it."""
+        if not self.layout.is_framed(frame):
             return "order"
         total = sum(frame) & 0xFF
-        kind: Checksum = "exclusive" if total == HEADER else "inclusive"
-        if total not in (0, HEADER) or self.checksum not in (kind, "auto"):
-            self.counters.bad_checksum += 1
-            self._agreed = (kind, 0)
-            return "checksum"
-        if self.checksum == "auto":
-            self._agreed = (kind, self._agreed[1] + 1 if self._agreed[0] == kind else 1)
-            if self._agreed[1] >= self.LOCK_AFTER:
-                self.checksum = kind
-        return None
+        kind = "inclusive" if total == 0 else "exclusive" if total == HEADER else "checksum"
+        return kind if self.checksum in (kind, "auto") else "checksum"
+
+    def _weighed(self, kind: str, window: bytes) -> str:
+        """What becomes of a good candidate, at the start of `window`, that could be two frames' data.
+
+        The frames that it would overlap must have arrived before that can be said: "wait" until then.
+        """
+        size, head = self.layout.frame_size, bytes((HEADER, self.layout.length))
+        for offset in self.layout.lookalikes:
+            rival = window[offset : offset + size]
+            if len(rival) < size and head.startswith(rival[:2]):
+                return "wait"
+            if self._verdict(rival) in _KINDS:
+                return "ambiguous"
+        return kind
+
+    def _count_kind(self, kind: str) -> None:
+        """Settle on the kind of checksum that enough good frames in a row had."""
+        self._agreed = (kind, self._agreed[1] + 1 if self._agreed[0] == kind else 1)
+        if self._agreed[1] >= self.LOCK_AFTER:
+            self.checksum = "inclusive" if kind == "inclusive" else "exclusive"
 
     def _reject(self, reason: str, events: list[SensorValues | Skipped]) -> None:
         if reason == "length":
             self.counters.bad_length += 1
+        elif reason == "order":
+            self.counters.bad_order += 1
+        elif reason == "checksum":
+            self.counters.bad_checksum += 1
+            self._agreed = (self.checksum, 0)
+        else:
+            self.counters.ambiguous += 1
         self._end_run(events)
         self._reason = reason
         self._skip(bytes((HEADER,)), events)
@@ -375,6 +328,7 @@ _PACKET = Argument("B", 0, 107)
 _CHARACTER = Argument("B", 32, 126)
 _RADIUS = Argument("h", -2000, 2000, (STRAIGHT, STRAIGHT_TOO))  # mm
 _DAY, _HOUR, _MINUTE = Argument("B", 0, 6), Argument("B", 0, 23), Argument("B", 0, 59)
+_DAYS = Argument("B", 0, 127)  # bit 0 = Sunday
 
 COMMANDS: dict[int, CommandSpec] = {
     spec.opcode: spec
@@ -406,13 +360,13 @@ COMMANDS: dict[int, CommandSpec] = {
         CommandSpec(163, "digits_raw", (_BYTE,) * 4),
         CommandSpec(164, "digits_ascii", (_CHARACTER,) * 4),
         CommandSpec(165, "buttons", (_BYTE,)),
-        CommandSpec(167, "schedule", (_BYTE, *(_HOUR, _MINUTE) * 7)),
+        CommandSpec(167, "schedule", (_DAYS, *(_HOUR, _MINUTE) * 7)),
         CommandSpec(168, "set_time", (_DAY, _HOUR, _MINUTE)),
         CommandSpec(173, "stop"),
     )
 }
 _BY_NAME = {spec.name: spec for spec in COMMANDS.values()}
-_SONG, _SONG_NOTES = 140, 16
+_SONG, _SONG_NOTES, _SENSORS = 140, 16, 142
 
 
 def encode(name: str, *values: int) -> bytes:
@@ -435,12 +389,18 @@ def encode(name: str, *values: int) -> bytes:
         if not argument.low <= value <= argument.high and value not in argument.besides:
             raise ValueError(f"{name}: got {value}; expected {argument.low} to {argument.high}")
     head = bytes((spec.opcode,)) + struct.pack(spec.code, *fixed)
+    if spec.opcode == _SENSORS:
+        members(fixed[0])
     if not spec.counted:
         return head
     if spec.opcode == _SONG:
         if len(rest) % 2 or not 2 <= len(rest) <= 2 * _SONG_NOTES:
             raise ValueError(f"song: got {len(rest)} values after the number; expected 1 to 16 notes with durations")
+        if not 0 <= min(rest) <= max(rest) <= 255:
+            raise ValueError(f"song: got notes and durations from {min(rest)} to {max(rest)}; expected 0 to 255")
         return head + bytes((len(rest) // 2, *rest))
+    if len(rest) > 255:
+        raise ValueError(f"{name}: got {len(rest)} packets; expected at most 255")
     for number in rest:
         members(number)
     return head + bytes((len(rest), *rest))
@@ -459,9 +419,15 @@ class CommandDecoder:
 
     Like the robot's own parser it waits for missing argument bytes for ever and takes the next command's for them;
     bytes that are no opcode are skipped. Values are not checked against their ranges: the robot clamps.
+
+    Attributes
+    ----------
+    commands, skipped_bytes : int
+        How many whole commands, and how many bytes that were no opcode, it has seen.
     """
 
     def __init__(self) -> None:
+        self.commands = self.skipped_bytes = 0
         self._buffer = bytearray()
 
     @property
@@ -478,6 +444,7 @@ class CommandDecoder:
         while start < len(buffer):
             spec = COMMANDS.get(buffer[start])
             if spec is None:
+                self.skipped_bytes += 1
                 events.append(Skipped(bytes((buffer[start],)), "opcode"))
                 start += 1
                 continue
@@ -491,6 +458,7 @@ class CommandDecoder:
                 if len(buffer) < end:
                     break
             values = struct.unpack(spec.code, bytes(buffer[start + 1 : fixed_end]))
+            self.commands += 1
             events.append(Command(spec.name, values + tuple(buffer[fixed_end + spec.counted : end])))
             start = end
         del buffer[:start]

@@ -12,7 +12,7 @@ import asyncio
 from collections.abc import Sequence
 from contextlib import AsyncExitStack
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 from .bus import Bus
 from .clock import now
@@ -77,6 +77,18 @@ class Base(Protocol):
     def halt(self) -> None:
         """Zero velocity at once."""
 
+    def arm(self) -> None:
+        """Somebody wants to move: be in the mode in which the wheels obey, and stay there while this is repeated.
+
+        Without it the base goes back, after a while, to the mode in which it can charge and sleep.
+        """
+
+    async def dock(self) -> None:
+        """Drive onto the charger by the base's own means; returns when it charges.
+
+        Raises DriverFault when it does not arrive.
+        """
+
 
 @runtime_checkable
 class Camera(Protocol):
@@ -105,17 +117,33 @@ class Labels(Protocol):
         """
 
 
+FollowEnd = Literal["distance", "marker", "end", "told"]
+
+
 @runtime_checkable
 class Follower(Protocol):
-    """Follows a line: publishes DriveCommands."""
+    """Follows a line: publishes DriveCommands with the `line_t` at which it last saw the line.
+
+    `blind` is how far before the robot, in metres from its origin, the nearest floor lies that it can see; `mode` is
+    how its camera is to run while the robot drives.
+    """
 
     name: str
+    blind: float
+    mode: CameraMode
 
-    async def follow(self, travelled: float) -> None:
+    async def follow(self, travelled: float, *, at_marker: bool = False) -> FollowEnd:
         """Drive along the line until `bus.odometry` says `travelled` metres since the leg began, then halt.
 
-        Raises MissionError when the line is lost or ends; the robot stands still then.
+        With `travelled` inf it goes on until told to stop. With `at_marker` it halts at the next marker beside the
+        line, too, and the line's end is a stop and no error. Returns why it halted.
+
+        Raises MissionError when the line is lost or ends; the robot stands still then, because the follower has
+        published a Withdrawal that says so.
         """
+
+    def stop_here(self) -> None:
+        """Have `follow` halt now and return "told": for a planner that decides on the way."""
 
 
 def available() -> dict[str, EntryPoint]:

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from robotd.clock import in_thread, now, outside, run_virtual, ticks
+from robotd.clock import in_thread, now, outside, run_virtual, stall, ticks
 
 
 def test_an_hour_of_ticks_keeps_exact_time():
@@ -89,3 +89,26 @@ def test_the_end_waits_for_threads_in_real_time():
 
     run_virtual(main())  # a time-out that virtual time ran into would be a warning, and warnings are errors
     assert release.is_set()
+
+
+def test_a_stall_makes_everything_that_was_due_late():
+    async def main():
+        loop, called = asyncio.get_running_loop(), []
+        for k in range(4):
+            loop.call_at(1.0 + 0.1 * k, lambda k=k: called.append((k, now())))
+        await asyncio.sleep(0.95)
+        stall(0.2)
+        assert called == []
+        await asyncio.sleep(1.0)
+        assert called == [(0, 1.15), (1, 1.15), (2, pytest.approx(1.2)), (3, pytest.approx(1.3))]
+
+    run_virtual(main())
+
+
+def test_on_an_ordinary_loop_a_stall_does_nothing():
+    async def main():
+        before = now()
+        stall(1e6)
+        assert now() - before < 1e6
+
+    asyncio.run(main())

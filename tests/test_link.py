@@ -1,13 +1,30 @@
 import asyncio
+import contextlib
+import errno
+import logging
 import os
 import pty
+import select
+import socket
+import termios
 import tty
+from pathlib import Path
 
 import pytest
 
 from robotd import link as link_module
+from robotd import real as real_module
+from robotd.clock import run_virtual
 from robotd.errors import DriverFault
-from robotd.link import open_serial
+from robotd.link import LentLink
+from robotd.real import RealHardware
+from robotd.serial_port import HALT
+
+NOWHERE = Path("/robotd/no/such/guardian.sock")  # so every link has a guardian of its own
+
+
+def open_serial(port, baud, guardian=NOWHERE):
+    return link_module.open_serial(port, baud, guardian)
 
 
 class Pair:
@@ -54,6 +71,7 @@ def test_bytes_travel_both_ways_with_their_time(pair):
         link.write(b"\x91\x00\x13\x11\x0d")
         assert os.read(pair.far, 100) == b"\x91\x00\x13\x11\x0d"
         link.set_baud(57600)
+        assert termios.tcgetattr(pair.near)[4:6] == [termios.B57600, termios.B57600]
         link.pulse_wake(1.0)  # a pseudo-terminal has no wake line: ignored
         link.close()
         link.close()
@@ -140,7 +158,7 @@ def test_bytes_that_came_before_the_unplugging_are_still_read(pair):
     asyncio.run(main())
 
 
-def test_a_port_in_use_says_so(pair):
+def test_a_port_in_use_says_so_and_one_whose_robot_is_being_halted_is_waited_for(pair):
     async def main():
         first = await open_serial(pair.port, 115200)
         with pytest.raises(DriverFault, match="in use by another program"):
@@ -151,18 +169,194 @@ def test_a_port_in_use_says_so(pair):
     asyncio.run(main())
 
 
-def test_a_missing_port_lists_those_that_exist(tmp_path, monkeypatch):
-    monkeypatch.setattr(link_module, "BY_ID", tmp_path)
-    with pytest.raises(DriverFault, match="is empty: is the adapter plugged in"):
-        asyncio.run(open_serial(str(tmp_path / "ttyUSB7"), 115200))
-    (tmp_path / "usb-FTDI_FT232R-if00-port0").touch()
-    with pytest.raises(DriverFault, match=r"no such port; there are .*usb-FTDI_FT232R-if00-port0"):
-        asyncio.run(open_serial(str(tmp_path / "ttyUSB7"), 115200))
+def test_a_missing_port_and_a_wrong_rate_are_explained():
+    with pytest.raises(DriverFault, match="/dev/robotd/none: no such port; "):
+        asyncio.run(open_serial("/dev/robotd/none", 115200))
+    with pytest.raises(DriverFault, match="found '12345' baud; expected one of 9600"):
+        asyncio.run(open_serial("/dev/robotd/none", 12345))
 
 
-def test_a_file_that_is_no_port_and_a_missing_permission_are_explained(tmp_path):
-    path = tmp_path / "notes.txt"
-    path.touch()
-    with pytest.raises(DriverFault, match="cannot be opened as a serial port"):
-        asyncio.run(open_serial(str(path), 115200))
-    assert "group dialout" in link_module._explain("/dev/ttyUSB0", PermissionError(13, "Permission denied"))
+def test_a_rate_that_does_not_exist_is_a_fault_of_the_link(pair):
+    async def main():
+        link = await open_serial(pair.port, 115200)
+        with pytest.raises(DriverFault, match="cannot be set to 12345 baud"):
+            link.set_baud(12345)
+        link.close()
+
+    asyncio.run(main())
+
+
+# ---- finding the guardian --------------------------------------------------------------------------------------------
+
+
+def test_a_service_of_systemd_starts_no_guardian_of_its_own_but_says_how_to_start_the_service(pair, monkeypatch):
+    monkeypatch.setenv("SYSTEMD_EXEC_PID", str(os.getpid()))
+    with pytest.raises(DriverFault, match=r"no guardian at .*enable --now robotd-guardian"):
+        asyncio.run(open_serial(pair.port, 115200))
+
+
+def test_a_guardian_that_is_down_or_not_permitted_or_does_not_start_is_explained(pair, tmp_path, monkeypatch):
+    path = tmp_path / "guardian.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(path))
+    with pytest.raises(DriverFault, match="no guardian listens there; start it: sudo systemctl restart"):
+        asyncio.run(open_serial(pair.port, 115200, path))
+    monkeypatch.setattr(link_module.sys, "executable", "/bin/false")
+    with pytest.raises(DriverFault, match=r"the guardian does not start: .*robotd.guardian --help"):
+        asyncio.run(open_serial(pair.port, 115200))
+    denied = link_module._explain_connection(path, PermissionError(errno.EACCES, "Permission denied"))
+    assert "group robotd" in denied
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [(b"hello", "without an answer"), (b"", "without an answer"), (b"lent ", "without an answer"), (None, "0.2 s")],
+)
+def test_a_guardian_that_answers_nonsense_or_nothing_is_a_fault(tmp_path, monkeypatch, answer, words):
+    monkeypatch.setattr(link_module, "ANSWER_S", 0.2)
+
+    async def main():
+        loop = asyncio.get_running_loop()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+            listener.bind(str(tmp_path / "guardian.sock"))
+            listener.listen()
+            listener.setblocking(False)
+            opening = asyncio.create_task(open_serial("/dev/ttyUSB0", 115200, tmp_path / "guardian.sock"))
+            connection, _ = await loop.sock_accept(listener)
+            with connection:
+                assert await loop.sock_recv(connection, 100) == b"open 115200 /dev/ttyUSB0"
+                if answer:
+                    connection.send(answer)
+                elif answer is not None:
+                    connection.close()
+                with pytest.raises(DriverFault, match=words):
+                    await opening
+
+    asyncio.run(main())
+
+
+def test_a_remark_about_the_port_is_logged_once(monkeypatch, caplog):
+    class Remarkable:
+        remark = "/dev/ttyUSB0: no low latency"
+
+    async def lend(port, baud, guardian):
+        assert guardian == Path("/there")
+        return Remarkable()
+
+    async def main():
+        hardware = RealHardware(Path("/there"))
+        for _ in range(2):
+            await hardware.open_serial("/dev/ttyUSB0", 115200)
+
+    monkeypatch.setattr(real_module, "open_serial", lend)
+    with caplog.at_level(logging.INFO):
+        asyncio.run(main())
+    assert caplog.messages == ["/dev/ttyUSB0: no low latency"]
+
+
+# ---- watching the guardian, in virtual time --------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def lent(pair):
+    """A link whose guardian is the test: (link, guardian's end)."""
+    ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    its.setblocking(False)
+    os.set_blocking(pair.far, False)
+    with its:
+        link = LentLink(pair.port, os.dup(pair.near), ours)
+        link.start()
+        try:
+            yield link, its
+        finally:
+            link.close()
+
+
+def hear(connection):
+    messages = []
+    with contextlib.suppress(BlockingIOError):
+        while message := connection.recv(100):
+            messages.append(message)
+    return messages
+
+
+def at_far_end(pair):
+    try:
+        return os.read(pair.far, 10_000)
+    except BlockingIOError:
+        return b""
+
+
+def test_heartbeats_leave_every_50_ms_and_stop_with_the_link(pair):
+    async def main():
+        with lent(pair) as (link, guardian):
+            for _ in range(20):
+                await asyncio.sleep(0.0501)
+                assert hear(guardian) == [b"beat"]
+                guardian.send(b"beat")
+            await asyncio.sleep(0.01)
+            link.close()
+            await asyncio.sleep(0.2)
+            assert guardian.recv(100) == b""
+
+    run_virtual(main())
+
+
+def test_an_unanswered_heartbeat_for_a_second_halts_the_robot_from_here(pair):
+    async def main():
+        with lent(pair) as (link, _):
+            await asyncio.sleep(0.99)
+            link.write(b"\x80")
+            assert at_far_end(pair) == b"\x80"
+            await asyncio.sleep(0.11)
+            with pytest.raises(DriverFault, match="the guardian has not answered for 1 s, so the robot was halted"):
+                await link.read()
+            assert at_far_end(pair) == HALT * 3
+            with pytest.raises(DriverFault, match="halted from here"):
+                link.write(b"\x91\x00\xc8\x00\xc8")
+            assert at_far_end(pair) == b""
+
+    run_virtual(main())
+
+
+def test_a_guardian_that_vanishes_leaves_the_halt_to_the_link(pair):
+    async def main():
+        with lent(pair) as (link, guardian):
+            guardian.close()
+            with pytest.raises(DriverFault, match="the guardian is gone, so the robot was halted from here"):
+                await link.read()
+            assert at_far_end(pair) == HALT * 3
+
+    run_virtual(main())
+
+
+def test_after_the_guardian_has_ended_the_loan_nothing_is_written(pair):
+    async def main():
+        with lent(pair) as (link, guardian):
+            guardian.send(b"ended no heartbeat for 0.25 s")
+            guardian.close()
+            with pytest.raises(DriverFault, match=r"the guardian has halted the robot: no heartbeat for 0\.25 s"):
+                await link.read()
+            with pytest.raises(DriverFault, match="no heartbeat"):
+                link.write(b"\x91\x00\xc8\x00\xc8")
+            assert at_far_end(pair) == b""
+
+    run_virtual(main())
+
+
+def test_a_process_that_hung_for_longer_than_the_guardian_waits_writes_nothing_afterwards(pair):
+    async def main():
+        link = await open_serial(pair.port, 115200)
+        os.set_blocking(pair.far, False)
+        while link.write(b"\x80" * 1000) or not link._queue:  # so that some is still queued here
+            pass
+        select.select([], [], [], 0.4)  # the loop hangs
+        with pytest.raises(DriverFault, match=r"this process hung for 0.*, so the guardian has halted the robot"):
+            link.write(b"\x91\x00\xc8\x00\xc8")
+        data = at_far_end(pair)
+        await asyncio.sleep(0.05)
+        assert b"\x91\x00\xc8" not in data + at_far_end(pair)
+        link.close()
+
+    asyncio.run(main())

@@ -1,11 +1,14 @@
 import itertools
 import struct
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotd import oi
+from robotd.roomba import line as roomba_line
+from tests.fuzz.adversary import BASE, LAYOUTS, Score, damaged, judge, tempting_frame, unbroken
 
 WORKED = bytes((19, 5, 29, 2, 25, 13, 0, 163))  # request 148 2 29 13; Create 2 Open Interface 2016
 WORKED_500 = WORKED[:-1] + bytes((182,))  # the same frame in the Roomba 500's manual, header not summed
@@ -130,6 +133,9 @@ def test_any_chunking_gives_the_same_events_and_every_byte_is_accounted_for(piec
     counters = whole.counters
     assert counters.frames == len(values_of(events))
     assert counters.skipped_bytes + counters.frames * SIZE <= len(data) == whole.fed
+    assert len(data) - counters.skipped_bytes - counters.frames * SIZE < SIZE  # the start of a frame, at most
+    rejected = [event for event in events if isinstance(event, oi.Skipped) and event.reason != "noise"]
+    assert counters.bad_length + counters.bad_order + counters.bad_checksum in (len(rejected), len(rejected) + 1)
 
 
 @settings(deadline=None)
@@ -154,12 +160,135 @@ def test_standing_still_makes_no_false_frame(phase):
     assert decoder.counters.bad_order <= 1
 
 
+def temptations(data, layout, checksum):
+    """How many windows of a stream have a frame's header, length and checksum."""
+    array = np.frombuffer(data, np.uint8)
+    total = np.concatenate([[0], np.cumsum(array, dtype=np.int64)])
+    starts = np.flatnonzero((array[:-1] == oi.HEADER) & (array[1:] == layout.length))
+    starts = starts[starts + layout.frame_size <= len(array)]
+    sums = total[starts + layout.frame_size] - total[starts]
+    return int((sums % 256 == (oi.HEADER if checksum == "exclusive" else 0)).sum())
+
+
+@pytest.mark.parametrize("checksum", [None, "auto"])
+def test_no_false_frame_in_a_million_adversarial_bytes(checksum):
+    """Equal frames full of headers, from any byte on: the length and the sum are right at far more places than frames.
+
+    Where the layout cannot be imitated every whole frame is found, too.
+    """
+    score, tempting, clear = Score(), 0, Score()
+    for stream in unbroken(np.random.default_rng(20), 1_000_000):
+        layout = oi.StreamLayout(stream.packet_ids)
+        tempting += temptations(stream.data, layout, stream.checksum)
+        judge(stream, score, checksum)
+        if not layout.lookalikes:
+            judge(stream, clear, checksum)
+    assert score.bytes >= 1_000_000
+    assert score.false == 0
+    assert tempting > score.sent + 10_000
+    assert clear.found == clear.sent > 10_000
+
+
+def test_damaged_streams_yield_no_more_false_frames_than_an_8_bit_sum_lets_through():
+    score, rng = Score(), np.random.default_rng(21)
+    for stream in unbroken(rng, 300_000, [BASE]):
+        decoder = oi.StreamDecoder(stream.packet_ids, stream.checksum)
+        true = set(stream.frames.values())
+        contents = [decoder.layout.decode(frame) for frame in true]
+        for event in decoder.feed(damaged(stream, rng, 0.003)):
+            if isinstance(event, oi.SensorValues):
+                score.found += 1
+                score.false += event.values not in contents
+        score.sent += len(stream.frames)
+    hurt = score.sent - score.found
+    assert hurt > 300
+    assert score.false <= 2 + 3 * hurt / 256
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**32), ids=st.sampled_from(LAYOUTS), phase=st.integers(0, 90), step=st.integers(1, 200))
+def test_equal_frames_that_look_like_others_are_found_in_step_or_not_at_all(seed, ids, phase, step):
+    layout = oi.StreamLayout(ids)
+    frame = tempting_frame(layout, np.random.default_rng(seed), "inclusive")
+    data = (frame * 12)[phase % layout.frame_size :]
+    decoder = oi.StreamDecoder(ids)
+    ends = [
+        event.end
+        for start in range(0, len(data), step)
+        for event in decoder.feed(data[start : start + step])
+        if isinstance(event, oi.SensorValues)
+    ]
+    whole = range(12 * layout.frame_size - phase % layout.frame_size, 0, -layout.frame_size)
+    assert set(ends) <= set(whole)
+    if not layout.lookalikes:
+        assert len(ends) == 12 - (phase % layout.frame_size > 0)
+
+
+def test_a_frame_that_can_be_imitated_is_told_by_where_the_last_one_ended():
+    ids = (100,)
+    layout = oi.StreamLayout(ids)
+    data = bytearray(layout.encode([0] * len(layout.keys)))
+    data[20:23] = 19, layout.length, 100
+    frame = layout.encode(list(layout.decode(bytes(data)).values()))
+    plain = layout.encode([1] * len(layout.keys))
+    torn = frame[:4] + b"\x07" + frame[5:]
+    window = (frame * 2)[20:]
+    assert layout.is_framed(window[: layout.frame_size])
+    assert sum(window[: layout.frame_size]) % 256 == 0
+    decoder = oi.StreamDecoder(ids)
+    assert len(values_of(decoder.feed(plain + torn + frame * 3))) == 4
+    assert decoder.counters.bad_checksum == 1
+    assert decoder.counters.ambiguous == 1
+
+    lost = oi.StreamDecoder(ids)
+    assert values_of(lost.feed(frame[5:] + frame * 3)) == []
+    assert lost.counters.ambiguous >= 3
+    assert len(values_of(lost.feed(plain * 3))) >= 2
+
+
+def test_the_driver_s_streams_cannot_be_imitated_by_their_own_data():
+    """StreamDecoder: then no window over two frames has its ids in order, and none is ever refused as ambiguous."""
+    requests = [value for name, value in vars(roomba_line).items() if name.startswith("PACKETS")]
+    assert requests
+    for ids in requests:
+        assert oi.StreamLayout(ids).lookalikes == ()
+    assert oi.StreamLayout((43, 44, 35)).lookalikes == ()
+    assert 20 in oi.StreamLayout((100,)).lookalikes
+    assert oi.StreamLayout((19,)).lookalikes == (2, 3, 4)
+
+
+@settings(deadline=None)
+@given(
+    before=st.lists(st.sampled_from([19, 5, 29, 13, 34, 255]), max_size=40).map(bytes),
+    rows=st.lists(st.tuples(st.integers(0, 0xFFFF), st.integers(0, 255)), min_size=1, max_size=3),
+)
+def test_a_false_header_with_any_length_delays_no_frame(before, rows):
+    """The length asked for is known, so another one is refused at once, and a right one waits for one frame at most."""
+    decoder = oi.StreamDecoder(IDS)
+    decoder.feed(before)
+    found = []
+    for a, b in rows:
+        found = values_of(decoder.feed(oi.encode_stream_frame(IDS, {29: a, 13: b})))
+        assert found[-1:] == [{29: a, 13: b}]
+        assert len(decoder.pending) < SIZE
+
+
+def test_answers_and_text_between_frames_cost_no_frame():
+    answer = oi.encode_values([0], dict.fromkeys(oi.members(0), 19))
+    data = b"".join(part + WORKED for part in (b"", answer, b"Soft reset!\r\n\xfe", bytes((19, 255)), bytes((19, 19))))
+    decoder = oi.StreamDecoder(IDS)
+    assert len(values_of(decoder.feed(data))) == 5
+    assert decoder.counters.skipped_bytes == len(data) - 5 * SIZE
+    assert decoder.pending == b""
+
+
 def test_a_long_text_between_frames_does_not_fill_the_buffer():
     decoder = oi.StreamDecoder(IDS)
     text = b"bat: 14210 mV\r\n" * 1000
     events = decoder.feed(text)
     assert skipped_of(events) + decoder.pending == text
     assert len(decoder.pending) < decoder.RUN
+    assert decoder.counters.skipped_bytes == len(text)
 
 
 @pytest.mark.parametrize(
@@ -236,8 +365,10 @@ def commands(draw):
                 lambda notes: [value for note in notes for value in note]
             )
         )
+    elif spec.name == "sensors":
+        values = [draw(st.sampled_from([*oi.PACKETS, *oi.GROUPS]))]
     elif spec.counted:
-        values += draw(st.lists(st.sampled_from([*oi.PACKETS, *oi.GROUPS]), max_size=40))
+        values += draw(st.lists(st.sampled_from([*oi.PACKETS, *oi.GROUPS]), max_size=255))
     return oi.Command(spec.name, tuple(values))
 
 
@@ -249,6 +380,32 @@ def test_every_command_round_trips_in_any_chunks(sent, cuts):
     decoder = oi.CommandDecoder()
     assert [event for a, b in itertools.pairwise(edges) for event in decoder.feed(data[a:b])] == sent
     assert decoder.pending == b""
+    assert (decoder.commands, decoder.skipped_bytes) == (len(sent), 0)
+
+
+@settings(deadline=None)
+@given(command=commands(), data=st.data())
+def test_every_question_s_answer_round_trips_by_the_command_that_the_robot_heard(command, data):
+    """Both ends agree on the answer's length from the question alone, because the answer carries no ids."""
+    ids = command.values if command.name in ("sensors", "query") else ()
+    (heard,) = oi.CommandDecoder().feed(oi.encode(command.name, *command.values))
+    ranges = {"B": (0, 255), "b": (-128, 127), "H": (0, 0xFFFF), "h": (-0x8000, 0x7FFF)}
+    rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    keys = sorted({key for number in ids for key in oi.members(number)})
+    values = {key: int(rng.integers(*ranges[oi.PACKETS[key].code])) for key in keys}
+    answer = oi.encode_values(heard.values if ids else (), values)
+    assert len(answer) == sum(oi.PACKETS[key].size for number in ids for key in oi.members(number))
+    assert oi.decode_values(ids, answer) == values
+
+
+def test_every_opcode_of_the_manual_is_known_with_its_number_of_arguments():
+    """Open Interface notes, section 3; counted commands are listed with their fixed arguments."""
+    arguments = {7: 0, 128: 0, 129: 1, 130: 0, 131: 0, 132: 0, 133: 0, 134: 0, 135: 0, 136: 0, 137: 4, 138: 1}
+    arguments |= {139: 3, 140: 1, 141: 1, 142: 1, 143: 0, 144: 3, 145: 4, 146: 4, 148: 0, 149: 0, 150: 1, 162: 2}
+    arguments |= {163: 4, 164: 4, 165: 1, 167: 15, 168: 3, 173: 0}
+    assert {opcode: struct.calcsize(spec.code) for opcode, spec in oi.COMMANDS.items()} == arguments
+    assert [opcode for opcode, spec in oi.COMMANDS.items() if spec.counted] == [140, 148, 149]
+    assert len({spec.name for spec in oi.COMMANDS.values()}) == len(oi.COMMANDS)
 
 
 @settings(deadline=None)
@@ -262,6 +419,7 @@ def test_noise_at_the_robot_never_raises_and_is_accounted_for(data, cuts):
     for event in events:
         if isinstance(event, oi.Skipped):
             assert event.data == data[used : used + 1]
+            assert event.reason == "opcode"
             used += 1
         else:
             spec = next(spec for spec in oi.COMMANDS.values() if spec.name == event.name)
@@ -269,6 +427,8 @@ def test_noise_at_the_robot_never_raises_and_is_accounted_for(data, cuts):
             variable = len(event.values) - len(spec.arguments)
             used += 1 + struct.calcsize(spec.code) + (1 + variable if spec.counted else 0)
     assert data[used:] == whole.pending
+    assert whole.skipped_bytes == sum(isinstance(event, oi.Skipped) for event in events)
+    assert whole.commands == len(events) - whole.skipped_bytes
 
 
 def test_a_missing_argument_swallows_the_next_command_and_repeated_starts_recover():
@@ -292,6 +452,11 @@ def test_a_missing_argument_swallows_the_next_command_and_repeated_starts_recove
         ("start", 1),
         ("stream", 200),
         ("song", 0, 60),
+        ("song", 0, 60, 256),
+        ("sensors", 59),
+        ("sensors", 99),
+        ("schedule", 128, *[0] * 14),
+        ("query", *[7] * 256),
         ("baud", 12),
         ("digits_ascii", 31, 65, 65, 65),
     ],

@@ -115,6 +115,17 @@ class Body:
         """Put the robot back where it was."""
         self.wheel_drop_left = self.wheel_drop_right = False
 
+    def place(self, pose: Pose) -> None:
+        """Carry the robot there: no wheel turns."""
+        self._pose = pose
+        self._slack = 0.0
+
+    def slip(self, left: float, right: float) -> None:
+        """Let each wheel's rim turn so many metres, at its next motion, without moving the robot."""
+        self._to_slip[0] += left
+        self._to_slip[1] += right
+        self.slips += 1
+
     def advance(self, t: float, left_speed: float, right_speed: float) -> None:
         """Turn the wheels with these nominal rim speeds (m/s) from the time of the last call to `t` seconds."""
         dt = t - self._t

@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 
 from ..clock import now, outside
 from ..errors import DriverFault
-from ..hardware import CameraMode, CameraSource, SerialLink
+from ..hardware import CameraCounts, CameraMode, CameraSource, SerialLink, Ticker
 from ..records import Frame
+from ..ticker import LoopTicker
 from .camera import RigRenderer
 from .floor import FloorRenderer
-from .roomba import RoombaLink
+from .pins import pin_factory
+from .roomba_link import RoombaLink
 from .world import FLOOR, RIG, World
 
 START = datetime(2026, 3, 2, 7, 30, tzinfo=UTC)  # the date at loop time 0
@@ -71,10 +73,12 @@ class SimHardware:
     def pins(self) -> Any:
         """A gpiozero factory of simulated pins."""
         if self._pins is None:
-            from gpiozero.pins.mock import MockFactory, MockPWMPin
-
-            self._pins = MockFactory(pin_class=MockPWMPin)
+            self._pins = pin_factory(self._world.pins)
         return self._pins
+
+    def ticker(self, period: float, function: Callable[[int], None]) -> Ticker:
+        """On the loop, whose time may be virtual."""
+        return LoopTicker(period, function)
 
     async def open_serial(self, port: str, baud: int) -> SerialLink:
         """Open the robot's serial port, /dev/robotd/base."""
@@ -196,6 +200,8 @@ class SimCameraSource:
         fps = min(max(mode.fps, 1.0), FASTEST)
         exposure = min(max(mode.exposure, SHORTEST), LONGEST, 1.0 / fps)
         self.mode = replace(mode, size=size, fps=fps, exposure=exposure)
+        self.remarks: tuple[str, ...] = ()
+        self.counts = CameraCounts()
         self._device = device
         self._name = name
         self._waiting: deque[tuple[float, int, Future[Image]]] = deque()
@@ -266,6 +272,8 @@ class SimCameraSource:
             # a microsecond apart, because timers of equal time fire in any order, and frames keep theirs
             self._last_delivery = max(delivery, self._last_delivery + 1e-6, self._loop.time())
             self._loop.call_at(self._last_delivery, self._deliver, stamp, self._count, rendering)
+        else:
+            self.counts.lost += 1
         self._count += 1
         self._timer = self._loop.call_at(self._begin + self._count / self.mode.fps + self._span, self._exposed)
 
@@ -274,6 +282,7 @@ class SimCameraSource:
             return
         if len(self._waiting) >= BUFFERS:
             self._waiting.popleft()
+            self.counts.dropped += 1
         self._waiting.append((stamp, sequence, rendering))
         self._arrived.set()
 

@@ -1,72 +1,54 @@
 """The simulated Roomba: an Open Interface byte machine on 15 ms ticks, with motors, encoders and a battery.
 
-`SimRoomba` does no I/O: bytes in, one tick at a time out. `RoombaLink` is the serial line to it in loop time.
+`SimRoomba` does no I/O: bytes in, one tick at a time out. `RoombaLink` (robotd.sim.roomba_link) is the serial line to
+it in loop time, robotd.sim.terminal a pseudo-terminal in real time.
 """
 
 from __future__ import annotations
 
-import asyncio
-import math
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .. import oi
-from ..errors import DriverFault
 from ..oi import FULL, OFF, PASSIVE, SAFE, TICK
+from .battery import CAPACITY_MAH, Battery
+from .dock import Dock
+from .programs import Programs
+from .quirks import LineFaults, RoombaQuirks
+from .roomba_body import RoombaBody
+from .roomba_replies import Replies
+from .roomba_sensors import MOTOR_MA, cleaning_ma, packet_sources
+from .roomba_text import PROCESSOR_SLEEP, READY, battery_line, boot_texts
 from .wheel import Wheel
+
+if TYPE_CHECKING:
+    from .roomba_link import Power, RoombaLink
+
+__all__ = ["CAPACITY_MAH", "LineFaults", "RoombaBody", "RoombaQuirks", "SimRoomba"]
 
 WHEEL_BASE_MM = 235.0  # as the firmware believes
 ROBOT_RADIUS_MM = 170.0
-SLEEP_AFTER = 300.0  # s in Passive without a byte received
-BOOT_TIME = 4.5  # s after opcode 7
+SLEEP_AFTER = 300.0  # s in Passive without a byte, a button or a pulse
 WAKE_TIME = 0.5
-CAPACITY_MAH = 2696.0
-BANNER = (
-    b"\r\nSoft reset!\r\n\xfeRoomba by iRobot!\r\nstm32\r\n2012-03-22-1549-L\r\n"
-    b"r3_robot/tags/release-3.2.6:4975 CLEAN\r\n\r\nbootloader id: 4718 5267 ABFF FFFF\r\n"
-)
+BAUD_PAUSE = 0.1  # s of deafness after a change of the baud rate
+BAUD_BACK = 0.9  # s after a reset
+PRESSED = 1.0 / 6.0  # s
+SHORT_PULSE = (0.05, 0.5)  # s: three of them set 19200 baud
+PULSES_FROM = 2.0  # s after power-up
+LEAST_PULSE = 0.01
+IDLE_MA = 160.0
+TOGGLE_S = 60.0  # two changes of mode within this time are a toggle
+REVIVE_MAH = 5.0
+CLEAN_ENDS = 0.1  # of the capacity: then it looks for its dock
+MODES = ("off", "passive", "safe", "full")
+BUTTONS = ("clean", "spot", "dock", "minute", "hour", "day", "schedule", "clock")  # bits of packet 18
 _ACTUATORS = {
     "drive", "motors", "leds", "play", "pwm_motors", "drive_direct", "drive_pwm", "scheduling_leds",
     "digits_raw", "digits_ascii",
 }  # fmt: skip
-_CLEANING = {"spot", "clean", "max", "dock", "power"}
-
-
-class RoombaBody(Protocol):
-    """What carries the robot through the world: motion of the wheels in, contacts out."""
-
-    left_rotation: float  # metres rolled since the start, forward positive
-    right_rotation: float
-    bump_left: bool
-    bump_right: bool
-    cliff: bool
-    wheel_drop_left: bool
-    wheel_drop_right: bool
-
-    def advance(self, t: float, left_speed: float, right_speed: float) -> None:
-        """Roll the wheels at these mean speeds (m/s) from the last instant until `t`."""
-
-
-@dataclass(frozen=True, slots=True)
-class RoombaQuirks:
-    """In which ways a robot and its cable differ from the manual.
-
-    `mode_offset` is added to packet 35; `checksum` may leave out the header; `wakes_by_brc` False needs the Clean
-    button; `baud` is the rate after power-up; `drop` and `flip` are probabilities per byte on the line, both ways;
-    `acceleration` of each wheel in m/s^2.
-    """
-
-    mode_offset: int = 0
-    checksum: oi.Checksum = "inclusive"
-    wakes_by_brc: bool = True
-    baud: int = 115200
-    drop: float = 0.0
-    flip: float = 0.0
-    acceleration: float = 0.75
+_CLEANING = {"spot", "clean", "max", "dock"}
 
 
 class SimRoomba:
@@ -77,7 +59,7 @@ class SimRoomba:
     body : RoombaBody
         Moved by the wheels; says what the bumpers, cliff sensors and wheel switches feel.
     rng : numpy Generator
-        Where the encoders start, and the faults of the line.
+        Where the encoders start, what the robot does by chance, and the faults of the line.
     quirks : RoombaQuirks, optional
 
     Attributes
@@ -87,204 +69,413 @@ class SimRoomba:
     baud : int
         What the robot's receiver and transmitter are set to now.
     is_asleep : bool
-    charge_mah : float
+    battery : Battery
+    left, right : Wheel
     overcurrent : int
-        Packet 14.
+        Packet 14; set from outside.
+    dock : Dock or None
+        Where its home base stands; set from outside. Without one, `set_docked` says whether it is docked.
+    listener : callable or None
+        Is told what happens, in words.
     link : RoombaLink or None
         Who is connected.
-    power : object or None
+    power : Power or None
         What ticks it; None until the first link switches it on.
     """
 
     def __init__(self, body: RoombaBody, rng: np.random.Generator, quirks: RoombaQuirks | None = None) -> None:
         self.body = body
-        self.rng = rng
         self.quirks = quirks or RoombaQuirks()
         self.mode = OFF
         self.baud = self.quirks.baud
         self.is_asleep = False
-        self.charge_mah = 0.93 * CAPACITY_MAH
+        self.battery = Battery(self.quirks.gauge_error_mah)
         self.overcurrent = 0
+        self.dock: Dock | None = None
+        self.listener: Callable[[str], None] | None = None
         self.link: RoombaLink | None = None
-        self.power: _Power | None = None
+        self.power: Power | None = None
         self.right = Wheel(int(rng.integers(0x10000)), self.quirks.acceleration)
         self.left = Wheel(int(rng.integers(0x10000)), self.quirks.acceleration)
+        if self.quirks.encoder_start is not None:
+            self.left.counts = self.right.counts = self.quirks.encoder_start
+        own_rng, *self.line_rng = rng.spawn(3)  # its own choices, and the line's two directions
         self._t: float | None = None
-        self._is_docked = False
-        self._current_ma = 0.0
-        self._radius_mm = 0
+        self._powered_at = 0.0
+        self.is_docked = False
+        self.is_plugged = False
+        self.programs = Programs(own_rng, self.tell)
+        self.radius_mm = 0
+        self.cleaning_motors = (0.0, 0.0, 0.0)  # main brush, side brush, vacuum, -1..1
+        self.leds = (0, 0, 0)  # bits, colour, intensity
         self._songs: dict[int, tuple[int, ...]] = {}
-        self._song, self._song_end = 0, -1.0
-        self._told_mm, self._told_deg = [0.0, 0.0], [0.0, 0.0]  # wheel sums at the last request of packets 19, 20
-        self._last_byte = 0.0
+        self.song, self._song_end = 0, -1.0
+        self._pressed: dict[str, float] = {}  # until when
+        self._woken_by_clean = False
+        self.is_after_cliff = False  # has dropped out of Safe mode at one, and was not told a mode since
+        self._left_passive: float | None = None  # when, while on a charger
+        self._last_active = 0.0
         self._boot_end: float | None = None
-        self._banner = b""
+        self._baud_back: float | None = None
+        self._deaf_until = self._frozen_until = -1.0
+        self._is_mute, self._is_flat = False, False
+        self._mute_at = self.quirks.mute_after
+        self._next_line, self._lines = 0.0, 0
         self._short_pulses = 0
         self._parser = oi.CommandDecoder()
-        self._layout: oi.StreamLayout | None = None
-        self._is_paused = False
-        self._asked: tuple[int, ...] = ()
-        self._answers = bytearray()
-        self._sources = self._packet_sources()
+        self.replies = Replies(packet_sources(self), self.quirks)
 
     # ---- what the world does to it -----------------------------------------------------------------------------------
 
     def pulse_brc(self, seconds: float) -> None:
         """The wake line was low for so long; three pulses of 50 to 500 ms change the baud rate to 19200."""
-        if self.is_asleep:
-            if self.quirks.wakes_by_brc:
-                self._wake()
+        quirks = self.quirks
+        if not quirks.brc_wired or (self.is_docked and not quirks.brc_works_on_dock) or seconds < LEAST_PULSE:
             return
-        if self.quirks.wakes_by_brc:
-            self._last_byte = self._now
-        self._short_pulses = self._short_pulses + 1 if 0.05 <= seconds <= 0.5 else 0
+        if self.is_asleep:
+            if quirks.wakes_by_brc:
+                self._wake("a pulse on the wake line")
+            return
+        if quirks.brc_keeps_awake:
+            self._last_active = self.now
+        if self.now - self._powered_at < PULSES_FROM:
+            return
+        self._short_pulses = self._short_pulses + 1 if SHORT_PULSE[0] <= seconds <= SHORT_PULSE[1] else 0
         if self._short_pulses == 3:
-            self.baud = 19200
+            self.baud, self._short_pulses = 19200, 0
+            self.tell("three short pulses on the wake line: 19200 baud")
+
+    def press(self, button: str, seconds: float = PRESSED) -> None:
+        """Somebody presses one of `BUTTONS`.
+
+        Clean wakes the robot or takes it out of Safe and Full mode. In Passive and Off, Clean, Spot and Dock start
+        and pause the robot's own programs, as without an Open Interface.
+        """
+        if self._is_flat or self._boot_end is not None:
+            return
+        if self.quirks.clock_buttons_dead and button in ("clock", "schedule"):
+            return
+        self._pressed[button] = self.now + seconds
+        self._last_active = self.now
+        if self.is_asleep:
+            if button == "clean":
+                self._woken_by_clean = True
+                self._wake("its Clean button")
+        elif self.mode in (OFF, PASSIVE):
+            if button in _CLEANING:
+                self._toggle(button)
+        elif button == "clean":
+            self._set_mode(PASSIVE, "its Clean button")
 
     def press_clean(self) -> None:
-        """Somebody presses the Clean button: wakes the robot, or takes it out of Safe mode."""
-        if self.is_asleep:
-            self._wake()
-        elif self.mode in (SAFE, FULL):
-            self._set_mode(PASSIVE)
+        """Somebody presses the Clean button."""
+        self.press("clean")
 
     def set_docked(self, is_docked: bool) -> None:
-        """Put it on the charger, which ends Safe mode, or lift it off."""
-        self._is_docked = is_docked
-        if is_docked and self.mode == SAFE:
-            self._set_mode(PASSIVE)
+        """Put it on its home base, which ends Safe mode, or lift it off."""
+        if is_docked == self.is_docked:
+            return
+        self.is_docked = is_docked
+        self.tell("on its dock" if is_docked else "off its dock")
+        if is_docked:
+            self.programs.end()
+            self._stop_wheels()
+            self._next_line = self.now + 1.0
+            if self.mode == SAFE:
+                self._set_mode(PASSIVE, "it is on the charger")
+        elif self.quirks.cleans_when_lifted_off_dock and self._woken_by_clean and self.mode == PASSIVE:
+            self._toggle("clean")
+        self._woken_by_clean = self._woken_by_clean and is_docked
+
+    def set_plugged(self, is_plugged: bool) -> None:
+        """Plug the mains charger into its side, or pull it out; while it is in, Safe mode ends at once."""
+        self.is_plugged = is_plugged
+
+    def pull_battery(self) -> None:
+        """Take the battery out and put it back: everything is forgotten."""
+        self._is_mute = self._is_flat = self.is_asleep = False
+        self._mute_at = None
+        self._powered_at = self.now
+        self._songs.clear()
+        self._frozen_until = -1.0
+        self._boot("the battery was out", soft=False)
 
     # ---- bytes in ----------------------------------------------------------------------------------------------------
 
     def receive(self, data: bytes) -> None:
         """Bytes that arrived at the robot, at its own baud rate."""
-        if self.is_asleep or self._boot_end is not None:
+        if not self.is_listening:
             return
-        self._last_byte = self._now
+        self._last_active = self.now
         for command in self._parser.feed(data):
-            if isinstance(command, oi.Command):
+            if isinstance(command, oi.Command) and self.is_listening:
                 self._obey(command.name, command.values)
 
     @property
-    def _now(self) -> float:
+    def charge_mah(self) -> float:
+        """What is left in the battery."""
+        return self.battery.charge_mah
+
+    @property
+    def is_at_charger(self) -> bool:
+        """Docked or plugged in."""
+        return self.is_docked or self.is_plugged
+
+    @property
+    def sees_cliff(self) -> bool:
+        """Whether a front cliff sensor says that there is no floor."""
+        return self.body.cliff or (self.is_docked and self.quirks.cliffs_on_dock)
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether a song is being played."""
+        return self.now < self._song_end
+
+    def pressed_buttons(self) -> int:
+        """Packet 18."""
+        return sum(self._pressed.get(button, -1.0) > self.now and 1 << bit for bit, button in enumerate(BUTTONS))
+
+    @property
+    def now(self) -> float:
+        """Time of the last tick."""
         return self._t if self._t is not None else 0.0
 
+    @property
+    def is_listening(self) -> bool:
+        """Whether it takes bytes at all."""
+        return not (self.is_asleep or self._boot_end is not None or self._is_silent) and self.now >= self._deaf_until
+
+    @property
+    def _is_silent(self) -> bool:
+        return self._is_mute or self._is_flat or self.now < self._frozen_until
+
+    def tell(self, what: str) -> None:
+        """Say to the listener what happens."""
+        if self.listener is not None:
+            self.listener(what)
+
     def _obey(self, name: str, values: tuple[int, ...]) -> None:
-        if self._boot_end is not None or (self.mode == OFF and name not in ("start", "reset")):
+        if self.mode == OFF and name not in ("start", "reset"):
             return
         if name in _ACTUATORS and self.mode == PASSIVE:
             return
         if name == "start":
-            self._set_mode(PASSIVE)
+            self.replies.restart()
+            self._set_mode(PASSIVE, "opcode 128")
         elif name == "reset":
-            self._boot(BOOT_TIME, BANNER)
+            self._boot("opcode 7", soft=True)
         elif name in ("safe", "control", "full"):
-            self._set_mode(FULL if name == "full" else SAFE)
+            self._set_mode(FULL if name == "full" else SAFE, f"opcode {132 if name == 'full' else 131}")
         elif name in _CLEANING:
-            self._set_mode(PASSIVE)
-            if name == "power":
-                self.is_asleep = True
+            running = self.programs.is_running
+            self._set_mode(PASSIVE, f"command {name}")
+            if not running:
+                self._toggle(name)
+        elif name == "power":
+            self._set_mode(PASSIVE, "opcode 133")
+            self._fall_asleep()
         elif name == "stop":
-            self._set_mode(OFF)
-            self._layout = None
+            self._set_mode(OFF, "opcode 173")
+            self.replies.stop_stream()
         elif name == "baud" and values[0] < len(oi.BAUD_CODES):
             self.baud = oi.BAUD_CODES[values[0]]
+            self._deaf_until = self.now + BAUD_PAUSE
+            self._parser = oi.CommandDecoder()
+            self.tell(f"{self.baud} baud")
         elif name in ("drive", "drive_direct", "drive_pwm"):
             self._drive(name, *values)
-        elif name == "song":
+        elif name in ("motors", "pwm_motors"):
+            self._run_motors(name, values)
+        elif name == "leds":
+            self.leds = values[0], values[1], values[2]
+        elif name == "buttons" and not self.quirks.buttons_command_dead:
+            for bit, button in enumerate(BUTTONS):
+                if values[0] >> bit & 1:
+                    self.press(button)
+        elif name == "song" and values[0] <= 4:
             self._songs[values[0]] = values[1:]
-        elif name == "play" and values[0] in self._songs:
-            self._song = values[0]
-            self._song_end = self._now + sum(self._songs[values[0]][1::2]) / 64.0
+        elif name == "play" and values[0] in self._songs and not self.is_playing:
+            self.song = values[0]
+            self._song_end = self.now + sum(self._songs[values[0]][1::2]) / 64.0
         elif name == "resume_stream":
-            self._is_paused = values[0] == 0
+            self.replies.pause(values[0] == 0)
         elif name in ("stream", "query", "sensors"):
-            self._ask(name, values)
+            self.replies.ask(name, values, self.now)
 
     def _drive(self, name: str, first: int, second: int) -> None:
         right, left = float(first), float(second)
-        self._radius_mm = 0
+        self.radius_mm = 0
         if name == "drive_pwm":
             right, left = right * 500.0 / 255.0, left * 500.0 / 255.0
         elif name == "drive":
             right = left = max(-500.0, min(500.0, float(first)))
-            self._radius_mm = second
+            self.radius_mm = second
             if second in (oi.SPIN_CLOCKWISE, oi.SPIN_COUNTER_CLOCKWISE):
                 right, left = right * second, -left * second
             elif second not in (oi.STRAIGHT, oi.STRAIGHT_TOO, 0):
                 radius = max(-2000, min(2000, second))
                 right *= 1.0 + 0.5 * WHEEL_BASE_MM / radius
                 left *= 1.0 - 0.5 * WHEEL_BASE_MM / radius
-        self.right.command(right)
-        self.left.command(left)
+        self._command_wheels(right, left)
 
-    def _ask(self, name: str, packet_ids: tuple[int, ...]) -> None:
-        if not all(number in oi.PACKETS or number in oi.GROUPS for number in packet_ids):
-            return  # the robot says nothing about packets that it does not know
-        if name != "stream":
-            self._asked += packet_ids
-        elif len(packet_ids) + sum(oi.PACKETS[key].size for number in packet_ids for key in oi.members(number)) < 256:
-            self._layout = oi.StreamLayout(packet_ids) if packet_ids else None
-            self._is_paused = False
+    def _command_wheels(self, right_mm_s: float, left_mm_s: float) -> None:
+        before = self._motion
+        self.right.command(right_mm_s)
+        self.left.command(left_mm_s)
+        if self._motion != before:
+            self.tell(f"{self._motion}: left {self.left.requested_mm_s}, right {self.right.requested_mm_s} mm/s")
 
-    def _set_mode(self, mode: int) -> None:
-        """Every change of mode stops the wheels."""
-        self.mode = mode
-        self.right.command(0.0)
-        self.left.command(0.0)
+    @property
+    def _motion(self) -> str:
+        """What the wheels are told to do, in words."""
+        right, left = self.right.target, self.left.target
+        if not (right or left):
+            return "stands"
+        if right * left < 0.0:
+            return "turns left" if right > left else "turns right"
+        return "drives forward" if right + left > 0.0 else "drives backward"
 
-    def _boot(self, seconds: float, banner: bytes) -> None:
-        self._set_mode(OFF)
-        self._parser = oi.CommandDecoder()
-        self._layout = None
-        self._asked = ()
-        self._answers.clear()
-        self._banner = banner
-        self._boot_end = self._now + seconds
+    def _stop_wheels(self) -> None:
+        self._command_wheels(0.0, 0.0)
 
-    def _wake(self) -> None:
+    def _run_motors(self, name: str, values: tuple[int, ...]) -> None:
+        if name == "pwm_motors":
+            self.cleaning_motors = values[0] / 127.0, values[1] / 127.0, max(0, values[2]) / 127.0
+            return
+        bits = values[0]
+        side, vacuum, brush = bits & 1, bits >> 1 & 1, bits >> 2 & 1
+        self.cleaning_motors = brush * (1.0 - 2 * (bits >> 4 & 1)), side * (1.0 - 2 * (bits >> 3 & 1)), float(vacuum)
+
+    # ---- modes, sleep, its own programs ------------------------------------------------------------------------------
+
+    def _set_mode(self, mode: int, why: str) -> None:
+        """Every command of a mode stops the wheels and the robot's own programs."""
+        before, self.mode = self.mode, mode
+        self.is_after_cliff = False
+        self.programs.end()
+        self._stop_wheels()
+        if mode in (OFF, PASSIVE):
+            self.cleaning_motors = 0.0, 0.0, 0.0
+        elif before in (OFF, PASSIVE):
+            self.leds = 0, 0, 0
+        if mode == OFF:
+            self._next_line = self.now + 1.0
+        if mode != before:
+            self.tell(f"mode {MODES[mode]}: {why}")
+            self._notice_toggle(before)
+
+    def _notice_toggle(self, before: int) -> None:
+        """Freeze the line, where the firmware does so, when Safe or Full is left or entered again on the charger."""
+        if not (self.quirks.freeze and self.is_at_charger):
+            return
+        was_passive, is_passive = before in (OFF, PASSIVE), self.mode in (OFF, PASSIVE)
+        if was_passive == is_passive:
+            return
+        if is_passive and self._left_passive is not None and self.now - self._left_passive < TOGGLE_S:
+            self._frozen_until = self.now + self.quirks.freeze
+            self.tell(f"serial line frozen for {self.quirks.freeze:g} s")
+        self._left_passive = None if is_passive else self.now
+
+    def _toggle(self, name: str) -> None:
+        """Start one of its own programs, or pause the one that runs."""
+        if self.programs.is_running:
+            self.programs.end()
+            self._stop_wheels()
+        else:
+            self.programs.start(name, self.dock, is_docked=self.is_docked)
+
+    def _behave(self, seconds: float) -> None:
+        programs, body = self.programs, self.body
+        if body.wheel_drop_left or body.wheel_drop_right:  # until it is set down
+            self._stop_wheels()
+            return
+        if programs.name == "clean" and self.battery.charge_mah < CLEAN_ENDS * CAPACITY_MAH:
+            programs.start("dock", self.dock, is_docked=False)
+        speeds = programs.step(seconds, hits=body.bump_left or body.bump_right or body.cliff)
+        self._command_wheels(*(speeds or (0.0, 0.0)))
+
+    def _fall_asleep(self) -> None:
+        self._stop_wheels()
+        self.is_asleep = True
+        self.tell("asleep")
+        self.replies.say(self.now, PROCESSOR_SLEEP)
+
+    def _wake(self, why: str) -> None:
         self.is_asleep = False
-        self._last_byte = self._now
-        self._boot(WAKE_TIME, b"")
+        self._last_active = self.now
+        self._forget(f"woken by {why}")
+        self._boot_end = self.now + WAKE_TIME
+
+    def _boot(self, why: str, *, soft: bool) -> None:
+        self._forget(f"reboots: {why}")
+        self.left.counts = self.right.counts = self.quirks.encoder_start or 0
+        self._boot_end = self.now + READY
+        self._baud_back = self.now + (BAUD_BACK if soft else 0.0)
+        for after, text in boot_texts(self.quirks.firmware, soft=soft):
+            self.replies.say(self.now + after, text)
+
+    def _forget(self, why: str) -> None:
+        self._set_mode(OFF, why)
+        self._parser = oi.CommandDecoder()
+        self.replies.forget()
+        self._deaf_until = self._song_end = -1.0
 
     # ---- one tick ----------------------------------------------------------------------------------------------------
 
     def tick(self, t: float) -> bytes:
         """Live until time `t`, one tick after the last; returns what the robot sends now, at its own baud rate."""
-        elapsed = TICK if self._t is None else t - self._t
+        if self._t is None:
+            elapsed, self._powered_at = TICK, t
+            self._last_active = t
+        else:
+            elapsed = t - self._t
         self._t = t
         body, left, right = self.body, self.left, self.right
+        if self.programs.is_running:
+            self._behave(elapsed)
         body.advance(t, left.ramp(elapsed), right.ramp(elapsed))
         left.measure(body.left_rotation)
         right.measure(body.right_rotation)
+        if self.dock is not None:
+            self.set_docked(
+                self.dock.touches(is_docked=self.is_docked) and not (body.wheel_drop_left or body.wheel_drop_right)
+            )
         self._use_battery(elapsed)
-        if self.mode == SAFE and (body.wheel_drop_left or body.wheel_drop_right or (body.cliff and self._approaches())):
-            self._set_mode(PASSIVE)
-        if self._boot_end is not None:
-            if t < self._boot_end:
-                return b""
-            self._boot_end = None
-            self._answers += self._banner
-            if self._banner:
-                self.baud = self.quirks.baud
-        if self.mode == PASSIVE and t - self._last_byte > SLEEP_AFTER:
-            self.is_asleep = True
-        if self.is_asleep:
+        if self.mode == SAFE:
+            self._mind_hazards()
+        self._mind_clock(t)
+        if self._is_silent:
             return b""
-        return self._send()
+        return self.replies.send(t, self.baud, is_streaming=self.mode != OFF and not self.is_asleep)
 
-    def _send(self) -> bytes:
-        budget = int(self.baud * TICK / 10.0)
-        sources, layout = self._sources, self._layout
-        if self._asked:
-            keys = {key for number in self._asked for key in oi.members(number)}
-            self._answers += oi.encode_values(self._asked, {key: sources[key]() for key in keys})
-            self._asked = ()
-        out = bytes(self._answers[:budget])
-        del self._answers[:budget]
-        if layout is not None and not self._is_paused and self.mode != OFF:
-            out += layout.encode([sources[key]() for key in layout.keys], self.quirks.checksum)
-        return out[:budget]  # what does not fit into the tick is lost, and with it the frame
+    def _mind_hazards(self) -> None:
+        body = self.body
+        if body.wheel_drop_left or body.wheel_drop_right:
+            self._set_mode(PASSIVE, "a wheel dropped")
+        elif self.is_plugged:
+            self._set_mode(PASSIVE, "the charger is plugged in")
+        elif self.sees_cliff and self._approaches():
+            self._set_mode(PASSIVE, "a cliff")
+            self.is_after_cliff = True
+
+    def _mind_clock(self, t: float) -> None:
+        """Boot, sleep and fall silent when it is time."""
+        if self._baud_back is not None and t >= self._baud_back:
+            self.baud, self._baud_back = self.quirks.baud, None
+        if self._boot_end is not None and t >= self._boot_end:
+            self._boot_end = None
+            self._last_active = t
+        idle = t - self._last_active
+        if idle > SLEEP_AFTER and self.mode == PASSIVE and not self.is_asleep and not self.programs.is_running:
+            self._fall_asleep()
+        is_off = self.mode == OFF and not self.is_asleep and self._boot_end is None
+        if is_off and self.is_at_charger and t >= self._next_line:
+            self._next_line = t + 1.0
+            self._lines += 1
+            self.replies.say(t, battery_line(self._lines, self.battery))
+        if self._mute_at is not None and t >= self._powered_at + self._mute_at:
+            self._is_mute, self._mute_at = True, None
+            self.tell("mute until the battery is taken out")
 
     def _approaches(self) -> bool:
         """Whether the wheels carry it forward, or backward in so tight a turn that the front swings out."""
@@ -295,198 +486,14 @@ class SimRoomba:
         return abs(forward) * WHEEL_BASE_MM < ROBOT_RADIUS_MM * abs(turn)
 
     def _use_battery(self, seconds: float) -> None:
-        if self.is_asleep:
-            self._current_ma = -2.0
-        elif self._is_docked and self.mode in (OFF, PASSIVE):
-            self._current_ma = 1200.0 if self.charge_mah < CAPACITY_MAH else 0.0
-        else:
-            self._current_ma = -160.0 - 900.0 * (abs(self.left.speed) + abs(self.right.speed))
-        charge = self.charge_mah + self._current_ma * seconds / 3600.0
-        self.charge_mah = max(0.0, min(CAPACITY_MAH, charge))
-
-    # ---- sensor packets ----------------------------------------------------------------------------------------------
-
-    def _packet_sources(self) -> dict[int, Callable[[], int]]:
-        """How every packet gets its value; those without a source in this world read zero."""
-        body, left, right = self.body, self.left, self.right
-        to_degrees = 180e3 / np.pi / WHEEL_BASE_MM
-        return dict.fromkeys(oi.PACKETS, lambda: 0) | {
-            7: lambda: body.bump_right | body.bump_left << 1 | body.wheel_drop_right << 2 | body.wheel_drop_left << 3,
-            10: lambda: int(body.cliff),
-            11: lambda: int(body.cliff),
-            14: lambda: self.overcurrent,
-            19: lambda: self._since(self._told_mm, 500.0, 500.0),
-            20: lambda: self._since(self._told_deg, -to_degrees, to_degrees),
-            21: lambda: 2 if self._current_ma > 0.0 else 0,
-            22: lambda: round(13000.0 + 3500.0 * self.charge_mah / CAPACITY_MAH + 0.3 * self._current_ma),
-            23: lambda: round(self._current_ma),
-            24: lambda: 25,
-            25: lambda: round(self.charge_mah),
-            26: lambda: round(CAPACITY_MAH),
-            28: lambda: 2800,
-            29: lambda: 10 if body.cliff else 2800,
-            30: lambda: 10 if body.cliff else 2800,
-            31: lambda: 2800,
-            34: lambda: 2 if self._is_docked else 0,
-            35: lambda: self.mode + self.quirks.mode_offset,
-            36: lambda: self._song,
-            37: lambda: int(self._now < self._song_end),
-            38: lambda: len(self._layout.packet_ids) if self._layout is not None else 0,
-            39: lambda: round(0.5 * (left.requested_mm_s + right.requested_mm_s)),
-            40: lambda: self._radius_mm,
-            41: lambda: right.requested_mm_s,
-            42: lambda: left.requested_mm_s,
-            43: lambda: left.counts,
-            44: lambda: right.counts,
-            54: lambda: round(900.0 * abs(left.speed)),
-            55: lambda: round(900.0 * abs(right.speed)),
-            58: lambda: int(left.speed + right.speed > 0.0),
-        }
-
-    def _since(self, told: list[float], by_left: float, by_right: float) -> int:
-        """A weighted sum of the wheels' travel since it was last asked for, cut to whole units."""
-        rolled = [self.body.left_rotation, self.body.right_rotation]
-        value = by_left * (rolled[0] - told[0]) + by_right * (rolled[1] - told[1])
-        told[:] = rolled
-        return max(-0x8000, min(0x7FFF, int(value)))
-
-
-class _Power:
-    """Ticks a robot on the running loop, whether or not somebody is connected: a robot left alone moves on."""
-
-    def __init__(self, roomba: SimRoomba) -> None:
-        self._roomba = roomba
-        self._loop = asyncio.get_running_loop()
-        self._start = self._loop.time()
-        self._ticks = 0
-        self._on_tick()
-
-    def _on_tick(self) -> None:
-        t = self._start + self._ticks * TICK
-        data = self._roomba.tick(t)
-        if data and self._roomba.link is not None:
-            self._roomba.link.deliver(t, data)
-        self._ticks += 1
-        self._loop.call_at(self._start + self._ticks * TICK, self._on_tick)
-
-
-class RoombaLink:
-    """A serial line to a simulated robot; see robotd.hardware.SerialLink.
-
-    A byte takes 10 bit times each way; what was written together arrives together, with its last byte. If the two
-    ends are set to different baud rates each hears noise. The first link to a robot switches it on.
-
-    Parameters
-    ----------
-    roomba : SimRoomba
-    baud : int
-
-    Raises
-    ------
-    DriverFault
-        Another link to it is open.
-    """
-
-    def __init__(self, roomba: SimRoomba, baud: int) -> None:
-        if roomba.link is not None:
-            raise DriverFault("the simulated robot's port is in use by another program; stop that first")
-        self._roomba = roomba
-        self._baud = baud
-        self._loop = asyncio.get_running_loop()
-        self._chunks: deque[tuple[float, bytes]] = deque()
-        self._arrived = asyncio.Event()
-        self._gone: str | None = None
-        self._out_free = self._in_free = 0.0
-        roomba.link = self
-        if roomba.power is None:
-            roomba.power = _Power(roomba)
-
-    async def read(self) -> tuple[float, bytes]:
-        """Wait for bytes; returns (loop time at which the last of them arrived, at least one byte)."""
-        while not self._chunks:
-            self._check()
-            self._arrived.clear()
-            await self._arrived.wait()
-        return self._chunks.popleft()
-
-    def write(self, data: bytes) -> None:
-        """Queue bytes for sending; never blocks."""
-        self._check()
-        self._out_free = max(self._out_free, self._loop.time()) + len(data) * 10.0 / self._baud
-        self._loop.call_at(self._out_free, self._reach_robot, data, self._baud)
-
-    def set_baud(self, baud: int) -> None:
-        """Change the speed of both directions."""
-        self._check()
-        self._baud = baud
-
-    def pulse_wake(self, seconds: float) -> None:
-        """Hold the wake line low for so long, in the background."""
-        self._check()
-        self._loop.call_later(seconds, self._roomba.pulse_brc, seconds)
-
-    def close(self) -> None:
-        """Send what is queued, then release the robot; safe to call twice."""
-        self._end("closed")
-
-    def unplug(self) -> None:
-        """Pull the cable: what is under way still arrives, nothing after it."""
-        self._end("unplugged; plug the adapter in again")
-
-    def deliver(self, t: float, data: bytes) -> None:
-        """The robot begins to send these bytes at time `t`."""
-        self._in_free = max(self._in_free, t) + len(data) * 10.0 / self._roomba.baud
-        self._loop.call_at(self._in_free, self._reach_host, data, self._roomba.baud)
-
-    def _reach_robot(self, data: bytes, baud: int) -> None:
-        self._roomba.receive(self._as_heard(data, baud, self._roomba.baud))
-
-    def _reach_host(self, data: bytes, baud: int) -> None:
-        data = self._as_heard(data, baud, self._baud)
-        if data and self._gone is None:
-            self._chunks.append((self._loop.time(), data))
-            self._arrived.set()
-
-    def _as_heard(self, data: bytes, sent: int, heard: int) -> bytes:
-        rng, quirks = self._roomba.rng, self._roomba.quirks
-        if sent != heard:
-            return _resampled(data, sent / heard)
-        if quirks.flip:
-            flips = rng.random(len(data)) < quirks.flip
-            data = bytes(
-                byte ^ 1 << int(rng.integers(8)) if flip else byte for byte, flip in zip(data, flips, strict=True)
-            )
-        if quirks.drop:
-            kept = rng.random(len(data)) >= quirks.drop
-            data = bytes(byte for byte, keep in zip(data, kept, strict=True) if keep)
-        return data
-
-    def _end(self, reason: str) -> None:
-        if self._gone is None:
-            self._gone = reason
-            self._roomba.link = None
-            self._chunks.clear()
-            self._arrived.set()
-
-    def _check(self) -> None:
-        if self._gone is not None:
-            raise DriverFault(f"the simulated robot's port is {self._gone}")
-
-
-def _resampled(data: bytes, ratio: float) -> bytes:
-    """What a receiver makes of bytes sent at `ratio` times its own baud rate: it samples where it expects the bits."""
-    levels = [level for byte in data for level in (0, *((byte >> bit) & 1 for bit in range(8)), 1)]
-    heard, place = bytearray(), 0.0
-
-    def level(at: float) -> int:
-        return levels[int(at)] if at < len(levels) else 1
-
-    while place < len(levels):
-        if level(place):  # idle
-            place = math.floor(place) + 1.0
-            continue
-        heard.append(sum(level(place + (1.5 + bit) * ratio) << bit for bit in range(8)))
-        place += 9.5 * ratio
-        while not level(place):  # no stop bit: it waits for the line to rise
-            place = math.floor(place) + 1.0
-    return bytes(heard)
+        battery = self.battery
+        charges = (
+            self.is_at_charger and (self.is_asleep or self.mode in (OFF, PASSIVE)) and not self.programs.is_running
+        )
+        load = 2.0 if self.is_asleep or self._is_flat else IDLE_MA + cleaning_ma(self)
+        battery.use(seconds, load + MOTOR_MA * (abs(self.left.speed) + abs(self.right.speed)), is_charging=charges)
+        if battery.is_empty and not self._is_flat:
+            self._forget("the battery is empty")
+            self._is_flat, self.is_asleep = True, False
+        elif self._is_flat and battery.charge_mah > REVIVE_MAH:
+            self.pull_battery()

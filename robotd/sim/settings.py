@@ -49,6 +49,11 @@ class WorldSettings:
     delay_max: float = ranged(0.120, minimum=0.0, maximum=5.0, doc="s from a frame's first light to its delivery")
     drop: float = ranged(0.005, minimum=0.0, maximum=1.0, doc="share of frames that never arrive")
 
+    hang_interval: float = ranged(
+        0.0, minimum=0.0, maximum=1e6, doc="s between hangs of the robot's computer on average; 0: none"
+    )
+    hang_longest: float = ranged(0.4, minimum=0.0, maximum=10.0, doc="s for which nothing runs there, at most")
+
     camera_rotation_error: float = ranged(math.radians(0.05), minimum=0.0, maximum=0.1, doc="per axis, one sigma")
     camera_translation_error: float = ranged(0.001, minimum=0.0, maximum=0.1, doc="m per axis, one sigma")
     focal_error: float = ranged(0.2, minimum=0.0, maximum=20.0, doc="px in fx and fy, one sigma")

@@ -10,13 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ..clock import stall
 from ..config import Calibration
 from ..geometry.transforms import rotation_matrix, rotation_vector
-from ..odometry import Wheels
+from ..odometry import Wheels, calibration_covariance
 from ..records import CameraModel, Floats, KnownLabel, Pose, Priors, Transform, Vector3
 from .body import Body
 from .labels import LabelSystem
 from .layout import StoreLayout
+from .pins import PinStates
 from .roomba import RoombaQuirks, SimRoomba
 from .scene import Scene
 from .settings import WorldSettings, load_settings
@@ -52,8 +54,9 @@ class World:
         The cameras as they truly are.
     body : Body
     roomba : SimRoomba
-    scene : Scene
     label_system : LabelSystem
+    pins : PinStates
+        What hangs on the robot's pins.
     unplugged : set of str
         Devices that are not there; see `unplug`.
     """
@@ -77,20 +80,40 @@ class World:
         start = Pose(float(x), float(y), float(self.line.heading_at(layout.line.stops[0])))
         self.body = Body(layout, settings, self.rng("body"), start)
         self.roomba = SimRoomba(self.body, self.rng("roomba"), quirks)
-        self.scene = Scene(layout, seed)
         ids = tuple(label.id for label in layout.labels)
         self.label_system = LabelSystem(ids, settings.labels, folder, self.rng("labels"))
+        self.pins = PinStates()
+        self._scene: Scene | None = None
         self.unplugged: set[str] = set()
         self._plugs: dict[str, Callable[[], None]] = {}
+
+    @property
+    def scene(self) -> Scene:
+        """What the rig's cameras see; made when the first of them is opened."""
+        if self._scene is None:
+            self._scene = Scene(self.layout, self.seed)
+        return self._scene
 
     def rng(self, name: str) -> np.random.Generator:
         """A random generator of its own for each name, so that no part's draws depend on another's."""
         return np.random.default_rng([self.seed, zlib.crc32(name.encode())])
 
     async def run(self) -> None:
-        """Let the world's own clockwork (the label system) run until cancelled."""
+        """Let the world's own clockwork (the label system, hangs of the computer) run until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self.label_system.run())
+            if self.settings.hang_interval > 0.0:
+                group.create_task(self._hang())
+
+    async def _hang(self) -> None:
+        """Now and then nothing runs on the robot's computer for a while, as when a callback computes for too long.
+
+        Virtual time would otherwise hide every lateness; in real time there is enough of it.
+        """
+        rng = self.rng("hangs")
+        while True:
+            await asyncio.sleep(rng.exponential(self.settings.hang_interval))
+            stall(rng.uniform(0.0, self.settings.hang_longest))
 
     def lit(self, t0: Floats, t1: Floats) -> Floats:
         """(..., L) light of every label, averaged over intervals (..., L) between two times in seconds."""
@@ -109,7 +132,13 @@ class World:
         """
         s = self.settings
         return Calibration(
-            wheels=Wheels(1.0, 1.0, s.wheel_base, s.travel_noise),
+            wheels=Wheels(
+                base=s.wheel_base,
+                travel_noise=s.travel_noise,
+                covariance=calibration_covariance(s.wheel_scale_error, s.wheel_base_error * s.wheel_base),
+                slip_length=s.slip_length,
+                slip_distance=s.slip_distance,
+            ),
             cameras=tuple(self._believed(camera) for camera in self.rig),
             floor_camera=self._believed(self.floor_camera),
             gamma=s.sensor.gamma,

@@ -1,0 +1,1 @@
+"""What the Roomba driver is made of: parts that know the robot and its line, but neither bus nor supervisor."""

@@ -1,0 +1,91 @@
+"""What is installed beside the package: units, users, udev rules."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+SYSTEMD = ROOT / "systemd"
+UNITS = ["robotd.service", "robotd-guardian.service"]
+
+
+def settings(unit):
+    lines = (SYSTEMD / unit).read_text().splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+@pytest.fixture
+def installed(tmp_path):
+    """The units with an ExecStart that exists here."""
+    for unit in UNITS:
+        text = (SYSTEMD / unit).read_text().replace("/opt/robotd/bin/", f"{Path(sys.executable).parent}/")
+        (tmp_path / unit).write_text(text)
+    return tmp_path
+
+
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed here")
+
+
+@needs_systemd
+@pytest.mark.parametrize("unit", UNITS)
+def test_systemd_finds_nothing_to_remark(installed, unit):
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(installed / unit)], capture_output=True, text=True, check=False
+    )
+    assert [line for line in (done.stdout + done.stderr).splitlines() if "robotd" in line] == []
+    assert done.returncode == 0
+
+
+@needs_systemd
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_exposure_is_low(installed, unit):
+    command = ["systemd-analyze", "security", "--offline=yes", "--threshold=15", str(installed / unit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_guardian_is_the_last_to_die_and_comes_back_for_ever():
+    found = settings("robotd-guardian.service")
+    for wanted in (
+        "OOMScoreAdjust=-1000",
+        "Restart=always",
+        "StartLimitIntervalSec=0",
+        "RuntimeDirectoryPreserve=restart",
+    ):
+        assert wanted in found
+
+
+def test_the_daemon_wants_the_guardian_but_does_not_go_down_with_it_and_has_no_right_to_serial_ports():
+    found = settings("robotd.service")
+    assert "Wants=network-online.target robotd-guardian.service" in found
+    assert "After=network-online.target robotd-guardian.service" in found
+    assert not [
+        line for line in found if line.startswith(("Requires", "BindsTo")) or "tty" in line or "dialout" in line
+    ]
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_forbidden_system_call_is_refused_and_does_not_kill(unit):
+    assert "SystemCallErrorNumber=EPERM" in settings(unit)  # libraries try sched_setaffinity and go on without it
+
+
+def test_every_user_and_group_of_the_units_is_made():
+    made = (SYSTEMD / "robotd-sysusers.conf").read_text().split()
+    for unit in UNITS:
+        for line in settings(unit):
+            key, _, names = line.partition("=")
+            if key in ("User", "Group", "SupplementaryGroups"):
+                assert set(names.split()) <= set(made)
+
+
+def test_every_udev_rule_is_made_of_matches_and_assignments():
+    rules = [line for line in (ROOT / "etc" / "60-robotd.rules").read_text().splitlines() if line[:1] not in ("#", "")]
+    assert any('ATTR{latency_timer}="1"' in rule for rule in rules)
+    assert any('ATTR{../../power/control}="on"' in rule for rule in rules)
+    for rule in rules:
+        for part in rule.split(", "):
+            assert part.endswith('"')
+            assert part.count('"') == 2
