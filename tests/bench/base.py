@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from robotd import oi
+from robotd.roomba.line import PACKETS
 
 from .table import Row, median_ms
 
 
 def rows() -> list[Row]:
     """Decoding one frame of the robot's sensor stream, against summing its bytes."""
-    ids = (7, 9, 10, 11, 12, 14, 21, 22, 25, 26, 35, 43, 44)
-    values = dict.fromkeys(ids, 0)
-    frame = oi.encode_stream_frame(ids, values, "inclusive")
-    decoder = oi.StreamDecoder(ids, "inclusive")
+    values = dict.fromkeys(PACKETS, 0)
+    frame = oi.encode_stream_frame(PACKETS, values, "inclusive")
+    decoder = oi.StreamDecoder(PACKETS, "inclusive")
     return [
         Row(
             f"sensor stream, {len(frame)} byte frame",
