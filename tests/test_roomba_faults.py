@@ -105,7 +105,7 @@ def test_a_bad_line_is_told_in_numbers_once_a_minute():
     async def scenario(bench):
         await bench.drive_for(125.0, 0.2, 0.1, period=0.1)
         counters = bench.driver.counters
-        assert counters.missing == pytest.approx(125 / 0.015 - counters.frames, abs=30)
+        assert counters.missing == pytest.approx(125 / 0.015 - counters.frames, abs=20)
         assert 0 < counters.bad_checksum <= counters.bad
 
     texts = bench_test(scenario, quirks=RoombaQuirks(line=LineFaults(flip=1e-3, direction="to_host"))).texts("warning")
