@@ -238,7 +238,7 @@ def test_noise_on_the_line_does_no_harm():
     bench = bench_test(scenario, quirks=RoombaQuirks(line=LineFaults(drop=1e-3, flip=1e-3)))
     assert bench.counters.frames > 1200
     assert bench.counters.bad_checksum > 10
-    assert bench.frame.left == pytest.approx(bench.body.left_rotation, abs=0.03)
+    assert bench.frame.left == pytest.approx(bench.body.left_rotation, abs=0.01)
 
 
 def test_ten_minutes_without_a_missed_frame():
