@@ -303,6 +303,13 @@ def test_a_release_is_read_however_the_text_is_cut_and_whatever_stands_before(te
     assert reader.firmware == firmware
 
 
+@pytest.mark.parametrize("cut", [1, 3, 16, 64])
+def test_a_sign_that_begins_in_the_last_letter_of_another_is_not_counted_twice(cut):
+    data = b"processor-sleeprocessor-sleep\r\n"
+    reader = BannerReader()
+    assert [item for at in range(0, len(data), cut) for item in reader.feed(data[at : at + cut])] == ["sleep"]
+
+
 @given(st.lists(st.binary(max_size=400), max_size=20))
 def test_noise_is_no_banner_and_takes_no_memory(chunks):
     reader = BannerReader()

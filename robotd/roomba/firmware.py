@@ -94,7 +94,7 @@ class BannerReader:
             at = text.find(sign)
             while at >= 0:
                 found.append((at, at + len(sign), meaning))
-                at = text.find(sign, at + 1)
+                at = text.find(sign, at + len(sign))
         found.sort(key=lambda item: item[0])
         if found:
             del text[: found[-1][1]]
