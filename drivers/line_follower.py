@@ -58,6 +58,7 @@ class LineFollowerConfig:
     fork_heading: float = ranged(0.0, minimum=-math.pi, maximum=math.pi)
     marker_size: float = ranged(0.050, minimum=0.01, maximum=0.2)
     exposure: float = ranged(0.010, minimum=0.0001, maximum=0.1)
+    gain: float | None = ranged(None, minimum=0.0)
     metres_per_pixel: float = ranged(0.0035, minimum=0.001, maximum=0.02)
     readout: float = ranged(0.030, minimum=0.0, maximum=0.1)
     view_near: float = ranged(0.20, minimum=0.0, maximum=2.0)
@@ -114,7 +115,7 @@ class LineFollowerDriver(Driver):
             raise ConfigError(f"{name}: {error}") from error
         self.view = self._eye.view
         self.blind = self._eye.blind
-        self.mode = CameraMode(size=model.size, fps=30.0, exposure=config.exposure)
+        self.mode = CameraMode(size=model.size, fps=30.0, exposure=config.exposure, gain=config.gain)
         self._row_time = config.readout / model.size[1]
         self.latest_line: tuple[Line, ...] = ()
         self._finder = MarkFinder(self.view, config.marker_size, config.color)

@@ -256,7 +256,7 @@ class MjpegDriver(CameraDriver):
             bad = 0
             waiting.counts.decoded += 1
             waiting.counts.decode_s += loop.time() - begun
-            self._publish(Frame(self.name, t, image, sequence), mode)
+            self._publish(Frame(self.name, t, image, sequence, data), mode)
 
     # ---- secrets ----------------------------------------------------------------------------------------------------
 

@@ -14,8 +14,8 @@ from robotd.hardware import CameraMode, CameraSource
 class V4l2Config:
     """[drivers.<camera>] with driver = "v4l2"
 
-    `device` is best one of /dev/v4l/by-path/, because those names survive replugging. What is given here replaces what
-    is asked for: `fps`, e.g. where four cameras share one USB bus, and `gain` in the camera's own units.
+    `device` is best one of /dev/v4l/by-path/, because those names survive replugging. `fps` replaces what is asked for,
+    e.g. where four cameras share one USB bus. `gain`, in the camera's own units, holds unless the mode has its own.
     """
 
     device: str
@@ -56,12 +56,12 @@ class V4l2Driver(CameraDriver):
         return replace(
             mode,
             fps=mode.fps if config.fps is None else config.fps,
-            gain=mode.gain if config.gain is None else config.gain,
+            gain=config.gain if mode.gain is None else mode.gain,
         )
 
     def _check_mode(self, source: CameraSource, asked: CameraMode) -> None:
         """Say what the camera does not do as asked; another size is a fault."""
-        given = source.mode
+        self.given = given = source.mode
         if given.size != asked.size:
             texts = (f"{width}x{height}" for width, height in (given.size, asked.size))
             raise DriverFault(
@@ -71,5 +71,6 @@ class V4l2Driver(CameraDriver):
         remarks = list(source.remarks)
         if not remarks and abs(given.fps / asked.fps - 1) > 0.01:
             remarks.append(f"gives {given.fps:g} frames a second instead of {asked.fps:g}")
+        self.remarks = tuple(remarks)
         for remark in remarks:
             self.report(f"{self.config.device} {remark}", "warning")

@@ -23,6 +23,11 @@ class CameraDriver(Driver):
     ----------
     counters : CameraCounters
         How the camera does, at any time.
+    wanted, given : CameraMode or None
+        The mode that it streams in, as asked for (None: it is stopped), and as the camera agreed to (None: it has not
+        streamed yet, or does not say).
+    remarks : tuple of str
+        What the camera does otherwise than asked, in words.
     """
 
     kind = "camera"
@@ -30,7 +35,11 @@ class CameraDriver(Driver):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._mode: CameraMode | None = None  # what is wanted; None: nothing
+        self.given: CameraMode | None = None
+        self.remarks: tuple[str, ...] = ()
         self._changed = asyncio.Event()
+        self._ended = asyncio.Event()  # no stream is running
+        self._ended.set()
         self._meter = CameraMeter()
         self._fps: float | None = None
         self._check_at = 0.0
@@ -42,8 +51,9 @@ class CameraDriver(Driver):
         self._want(mode)
 
     async def stop(self) -> None:
-        """Stop streaming."""
+        """Stop streaming; returns when the stream has ended, so that another camera may have its place on the bus."""
         self._want(None)
+        await self._ended.wait()
 
     async def run(self) -> None:
         """Stream whenever started; raises DriverFault when the camera fails."""
@@ -52,7 +62,16 @@ class CameraDriver(Driver):
             if self._mode is None:
                 await self._changed.wait()
                 continue
-            await first_of(self._stream(self._mode), self._changed.wait())
+            self._ended.clear()
+            try:
+                await first_of(self._stream(self._mode), self._changed.wait())
+            finally:
+                self._ended.set()
+
+    @property
+    def wanted(self) -> CameraMode | None:
+        """The mode that was asked for."""
+        return self._mode
 
     @property
     def counters(self) -> CameraCounters:

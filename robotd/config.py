@@ -43,7 +43,8 @@ class MissionConfig:
     """[mission]
 
     With `stop_at` "distances" the robot stops at `stops`, metres along the line; with "markers" where it starts, then
-    at each square or dot beside the line, until the line ends or `marker_stops` stops are made.
+    at each square or dot beside the line, until the line ends or `marker_stops` stops are made. `camera_groups` are
+    the rig's cameras that look at the same time, one group after the other; empty: all at once.
     """
 
     survey: str = "store"
@@ -55,6 +56,8 @@ class MissionConfig:
     identify: IdentifyConfig = field(default_factory=IdentifyConfig)
     stop_at: Literal["distances", "markers"] = "distances"
     marker_stops: int = ranged(0, minimum=0, maximum=10000)
+    mains_hz: Literal[50, 60] = 50
+    camera_groups: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if any(later <= earlier for earlier, later in zip(self.stops, self.stops[1:], strict=False)):
@@ -67,6 +70,8 @@ class MissionConfig:
         twice = sorted(label for label, count in counts.items() if count > 1)
         if twice:
             raise ValueError(f"labels: {', '.join(twice)} listed more than once; expected every id once")
+        if not all(self.camera_groups):
+            raise ValueError("camera_groups: found an empty group; expected names of cameras in each")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from .config import Calibration, Config, collect, load_calibration, load_config,
 from .control import ControlLoop
 from .errors import ConfigError, DriverFault, UploadError
 from .files import map_to_json
-from .hardware import Hardware
+from .hardware import Hardware, flicker_free
 from .journal import Journal
 from .mission import Health, Mission, complete_map
 from .notify import notify
@@ -163,6 +164,7 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
         for camera in calibration.cameras
         if camera.name not in cameras
     ]
+    problems += _check_groups(path, config, calibration)
     serial_log = _serial_log(path, config, plans, calibration)
     if serial_log is not None:
         hardware = LoggedHardware(hardware, plans[_of_kind(plans, "base")[0]].config.port, serial_log)
@@ -182,6 +184,17 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
     eye = drivers[str(plans[follower.name].config.camera)]
     beacons = next((drivers[name] for name in _of_kind(plans, "beacons")), None)
     return Assembly(path, config, calibration, bus, hardware, base, follower, labels, rig, eye, beacons, serial_log)
+
+
+def _check_groups(path: Path, config: Config, calibration: Calibration) -> list[str]:
+    """The mistakes of mission.camera_groups: every camera of the rig belongs to one group."""
+    groups = config.mission.camera_groups
+    named = Counter(name for group in groups for name in group)
+    rig = {camera.name for camera in calibration.cameras}
+    if not groups or (named.keys() == rig and max(named.values()) == 1):
+        return []
+    found = ", ".join(name for group in groups for name in group)
+    return [f"{path} mission.camera_groups: found {found}; expected each of {', '.join(sorted(rig))} once"]
 
 
 def _serial_log(path: Path, config: Config, plans: Mapping[str, Plan], calibration: Calibration) -> SerialLog | None:
@@ -308,7 +321,10 @@ class Daemon:
     async def _run_mission(self, journal: Journal, uploader: Uploader | None, state: Path) -> None:
         assembly, config = self.assembly, self.assembly.config
         identify = replace(
-            config.mission.identify, gamma=assembly.calibration.gamma, row_time_s=assembly.calibration.row_time_s
+            config.mission.identify,
+            gamma=assembly.calibration.gamma,
+            row_time_s=assembly.calibration.row_time_s,
+            exposure_s=flicker_free(config.mission.identify.exposure_s, config.mission.mains_hz),
         )
         self.mission = mission = Mission(
             replace(config.mission, identify=identify),

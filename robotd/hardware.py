@@ -6,6 +6,7 @@ Drivers get everything they touch from a `Hardware`. `RealHardware` opens device
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
@@ -37,13 +38,25 @@ class SerialLink(Protocol):
 class CameraMode:
     """What a camera is asked for: size in pixels (width, height), frames per second, exposure in seconds.
 
-    `gain` is in the camera's own units; None: its default.
+    `gain` is in the camera's own units; None: its default. Lamps flicker at twice `mains_hz`.
     """
 
     size: tuple[int, int] = (640, 480)
     fps: float = 30.0
     exposure: float = 0.010
     gain: float | None = None
+    mains_hz: float = 50.0
+
+
+def flicker_free(exposure: float, mains_hz: float) -> float:
+    """The exposure in seconds, at least one period of the lamps' flicker, that is nearest and of whole periods."""
+    period = 0.5 / mains_hz
+    return max(1, round(exposure / period)) * period
+
+
+def is_flicker_free(exposure: float, mains_hz: float) -> bool:
+    """Whether an exposure of so many seconds has whole periods of the lamps' flicker, within 3 %."""
+    return math.isclose(exposure, flicker_free(exposure, mains_hz), rel_tol=0.03)
 
 
 @dataclass(slots=True)

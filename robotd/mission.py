@@ -34,7 +34,6 @@ from .records import Event, Frame, Map, MappedLabel, MissionStatus, Pose, Sighti
 T = TypeVar("T")
 State = Literal["idle", "driving", "settling", "observing", "uploading", "paused", "fault", "done"]
 
-OBSERVING = CameraMode(size=(640, 480), fps=30.0, exposure=0.010)  # a multiple of 10 ms: mains lamps do not flicker
 FIRST_FRAME_S = 5.0  # a camera that shows nothing for so long after its start is at fault
 STANDSTILL_M_S = 0.002
 FAULT_WAIT_S = 60.0
@@ -101,6 +100,7 @@ class Mission:
         self.stops: list[Stop] = []
         self.ended: str | None = None  # why the mission ended early, in words
         self._workers: ThreadPoolExecutor | None = None
+        self._groups = config.camera_groups or (tuple(cameras),)
 
     async def run(self) -> None:
         """Make every stop that can be made; afterwards `stops` and `ended` say what came of it."""
@@ -125,8 +125,9 @@ class Mission:
                         self.bus.events.publish(Event(now(), "mission", "info", text))
                         break
                     await self._through_faults("settling", number, self._settle)
-                    sightings = await self._through_faults("observing", number, self._observe)
-                    await self._record(number, sightings)
+                    seen: list[tuple[Sighting, ...]] = []  # by each group of cameras
+                    await self._through_faults("observing", number, partial(self._observe, seen))
+                    await self._record(number, [sighting for group in seen for sighting in group])
             except MissionError as error:
                 self.ended = str(error)
                 self._halt(self.ended)
@@ -175,20 +176,25 @@ class Mission:
             if state is None or abs(state.speed) > STANDSTILL_M_S or abs(state.turn_rate) > 10 * STANDSTILL_M_S:
                 quiet = now()
 
-    async def _observe(self) -> tuple[Sighting, ...]:
-        identifier = Identifier(self.config.labels, tuple(self.cameras), self.config.identify)
+    async def _observe(self, seen: list[tuple[Sighting, ...]]) -> None:
+        """Add what each group of cameras sees, one group after the other; those that have looked are left out."""
+        for group in self._groups[len(seen) :]:
+            seen.append(await self._look(group))
+
+    async def _look(self, group: Sequence[str]) -> tuple[Sighting, ...]:
+        """What these cameras see in slots of their own."""
+        mode = CameraMode(exposure=self.config.identify.exposure_s, mains_hz=self.config.mains_hz)
+        identifier = Identifier(self.config.labels, tuple(group), self.config.identify)
         async with AsyncExitStack() as stack:
-            for name, camera in self.cameras.items():
+            for name in group:
                 frames = stack.enter_context(self.bus.frames(name).subscribe(size=8))
-                await camera.start(OBSERVING)
-                stack.push_async_callback(camera.stop)
-                async with asyncio.timeout(FIRST_FRAME_S) as limit:
-                    try:
+                await self.cameras[name].start(mode)
+                stack.push_async_callback(self.cameras[name].stop)
+                try:
+                    async with asyncio.timeout(FIRST_FRAME_S):
                         await frames.get()
-                    except TimeoutError:
-                        if limit.expired():
-                            raise DriverFault(f"{name}: no frame for {FIRST_FRAME_S:g} s; check the camera") from None
-                        raise
+                except TimeoutError:
+                    raise DriverFault(f"{name}: no frame for {FIRST_FRAME_S:g} s; check the camera") from None
                 watch = asyncio.create_task(self._watch(identifier, name, frames))
                 stack.push_async_callback(_cancel, watch)
             while (slot := identifier.next_slot()) is not None:

@@ -26,12 +26,14 @@ class Frame:
 
     `t` is the loop time of the camera's own stamp (start of the exposure of the first row), in seconds.
     `image` is (H, W) uint8 grey, read-only. `sequence` counts frames of one stream; a gap is a dropped frame.
+    `encoded` is the JPEG as the camera sent it, of which `image` is one channel, perhaps at a reduced size.
     """
 
     camera: str
     t: float
     image: NDArray[np.uint8]
     sequence: int = 0
+    encoded: bytes | None = None
 
     def __post_init__(self) -> None:
         self.image.flags.writeable = False

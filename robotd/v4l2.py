@@ -15,7 +15,6 @@ import asyncio
 import contextlib
 import ctypes
 import errno
-import math
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from . import jpeg
+from . import jpeg, v4l2_controls
 from . import v4l2_api as api
 from .camera_feed import FrameQueue
 from .clock import in_thread
@@ -41,7 +40,6 @@ WAKE_S = 0.2  # the thread looks so often whether it shall end
 RELEASE_S = 3.0  # for a closed camera to give its device back
 KERNEL_STAMP_S = 1.0  # a stamp further from now than this is not on the monotonic clock
 FALLBACK_FPS = 15.0
-FLICKER_S = 0.010  # lamps on 50 Hz mains flicker at 100 Hz
 COMPRESSED = ("MJPG", "JPEG")
 LUMINANCE_FIRST = ("GREY", "Y800", "NV12", "NV21", "YU12", "YV12")  # whole lines of grey, before any chroma
 PACKED = {"YUYV": 0, "YVYU": 0, "UYVY": 1, "VYUY": 1}  # which of every two bytes is grey
@@ -130,16 +128,18 @@ class V4l2Source:
         stamp = buffer.seconds + 1e-6 * buffer.microseconds
         is_monotonic = buffer.flags & api.CLOCK_MASK == api.CLOCK_MONOTONIC
         t = stamp if is_monotonic and abs(arrived - stamp) < KERNEL_STAMP_S else arrived
-        image = None
+        image, encoded = None, None
         if not buffer.flags & api.ERROR:
-            image = decode(self._camera.areas[buffer.index][: buffer.bytesused], self._camera)
+            data = self._camera.areas[buffer.index][: buffer.bytesused]
+            image = decode(data, self._camera)
+            encoded = bytes(data) if self._camera.pixels in COMPRESSED else None
         if image is None:
             self.counts.damaged += 1  # and a gap in the sequence
             return
         self.counts.decoded += 1
         self.counts.decode_s += self._loop.time() - arrived
         if not self.is_closed:
-            self._tell(self._queue.put, Frame(self.name, t, image, sequence))
+            self._tell(self._queue.put, Frame(self.name, t, image, sequence, encoded))
 
     def _tell(self, method: Any, argument: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is gone: nobody is left to be told
@@ -162,6 +162,9 @@ class V4l2Cameras:
                 )
             if not await in_thread(before.wait_released, RELEASE_S):
                 raise DriverFault(f"{device} does not end its last stream; unplug it and plug it in again")
+        for other in self._open.values():
+            if other.is_closed:  # but its thread may still hold its share of the bus
+                await in_thread(other.wait_released, RELEASE_S)
         source = self._open[device] = V4l2Source(device, name, await in_thread(negotiate, device, mode))
         return source
 
@@ -198,7 +201,8 @@ def negotiate(device: str, mode: CameraMode) -> Negotiated:
         pixels = _choose_pixels(node, device)
         camera = _set_format(node, device, mode, pixels)
         _set_rate(camera, mode.fps)
-        _lock(camera, mode)
+        camera.mode, remarks = v4l2_controls.lock(camera.node, camera.mode)
+        camera.remarks += remarks
         _begin(device, camera)
     except BaseException as error:
         node.close()
@@ -327,7 +331,8 @@ def _begin(device: str, camera: Negotiated) -> None:
             return
     raise DriverFault(
         f"{device} cannot stream at {camera.given[0]}x{camera.given[1]}: its USB bus has no room (no space left on "
-        "device); put it on another USB controller, or lower fps of every camera on this one"
+        "device); put it on another USB controller, lower fps of every camera on this one, or let the cameras look in "
+        "turns (camera_groups in [mission])"
     )
 
 
@@ -356,84 +361,6 @@ def _stop(camera: Negotiated) -> None:
 def _release(camera: Negotiated) -> None:
     _stop(camera)
     camera.node.close()
-
-
-# ---- exposure and whatever else changes brightness -------------------------------------------------------------------
-
-
-def _lock(camera: Negotiated, mode: CameraMode) -> None:
-    """Lock exposure, gain, white balance and focus, and see what came of it."""
-    node, remarks = camera.node, camera.remarks
-    for control, value in (
-        (api.EXPOSURE_AUTO_PRIORITY, 0),  # because it trades the frame rate for brightness
-        (api.EXPOSURE_AUTO, api.EXPOSURE_MANUAL),
-        (api.AUTO_GAIN, 0),
-        (api.AUTO_WHITE_BALANCE, 0),
-        (api.BACKLIGHT_COMPENSATION, 0),
-        (api.FOCUS_AUTO, 0),
-    ):
-        query = _query(node, control)
-        if query is not None and _set(node, query, value) != value and control != api.BACKLIGHT_COMPENSATION:
-            remarks.append(f"does not turn off its automatic {_LOCKS[control]}; use a camera that can be locked")
-    query = _query(node, api.EXPOSURE_ABSOLUTE)
-    exposure = mode.exposure
-    if query is None:
-        remarks.append("has no manual exposure; flashes and lamps cannot be told apart well, use another camera")
-    else:
-        exposure = _set(node, query, round(mode.exposure / api.EXPOSURE_UNIT)) * api.EXPOSURE_UNIT
-        if abs(exposure / mode.exposure - 1.0) > 0.02:
-            remarks.append(
-                f"exposes for {1e3 * exposure:g} ms instead of {1e3 * mode.exposure:g} ms; it offers "
-                f"{1e3 * query.minimum * api.EXPOSURE_UNIT:g} to {1e3 * query.maximum * api.EXPOSURE_UNIT:g} ms"
-            )
-            if _is_flicker_free(mode.exposure) and not _is_flicker_free(exposure):
-                remarks.append("exposes for no multiple of 10 ms: lamps on 50 Hz mains flicker in its images")
-    gain = mode.gain
-    query = _query(node, api.GAIN)
-    if query is not None:
-        wanted = query.default_value if gain is None else round(gain)
-        gain = _set(node, query, wanted)
-        if gain != wanted:
-            remarks.append(f"has a gain of {gain:g} instead of {wanted}; it offers {query.minimum} to {query.maximum}")
-    elif gain is not None:
-        remarks.append("has no gain that can be set")
-    camera.mode = replace(camera.mode, exposure=exposure, gain=gain)
-
-
-_LOCKS = {
-    api.EXPOSURE_AUTO_PRIORITY: "frame rate",
-    api.EXPOSURE_AUTO: "exposure",
-    api.AUTO_GAIN: "gain",
-    api.AUTO_WHITE_BALANCE: "white balance",
-    api.FOCUS_AUTO: "focus",
-}
-
-
-def _is_flicker_free(exposure: float) -> bool:
-    periods = exposure / FLICKER_S
-    return round(periods) > 0 and math.isclose(periods, round(periods), rel_tol=0.03)
-
-
-def _query(node: VideoNode, control: int) -> api.QueryControl | None:
-    query = api.QueryControl(id=control)
-    try:
-        node.ioctl(api.QUERYCTRL, query)
-    except OSError:
-        return None
-    return None if query.flags & (api.DISABLED | api.READ_ONLY) else query
-
-
-def _set(node: VideoNode, query: api.QueryControl, value: int) -> int:
-    """Set a control to the nearest value that it allows; returns what it then says."""
-    step = max(1, query.step)
-    value = min(max(value, query.minimum), query.maximum)
-    value = min(query.minimum + round((value - query.minimum) / step) * step, query.maximum)
-    control = api.Control(id=query.id, value=value)
-    with contextlib.suppress(OSError):  # reading it back shows it
-        node.ioctl(api.S_CTRL, control)
-    control = api.Control(id=query.id)
-    node.ioctl(api.G_CTRL, control)
-    return int(control.value)
 
 
 # ---- small ones ------------------------------------------------------------------------------------------------------

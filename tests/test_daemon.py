@@ -52,6 +52,7 @@ def test_the_example_explains_every_key_and_its_comments_show_the_defaults():
                     "known_labels",
                     "wake_pin",
                     "serial_log",
+                    "gain",
                 ):
                     problems.append(f"{where}.{item.name}: shows {getattr(bound, item.name)}, the default is {default}")
 

@@ -18,7 +18,8 @@ class FakeCamera:
     """A camera and its state across openings.
 
     `formats` lists rates by pixel format and size; `controls` gives [minimum, maximum, step, default, value] by id;
-    `room` is how many pixels a second the USB bus still carries; `stuck` names controls that ignore what is set.
+    `room` is how many pixels a second the USB bus carries, for all cameras on `bus`; `stuck` names controls that ignore
+    what is set.
     """
 
     def __init__(self, formats=None, controls=None):
@@ -35,6 +36,7 @@ class FakeCamera:
             api.BACKLIGHT_COMPENSATION: [0, 2, 1, 1, 1],
         }
         self.room = float("inf")
+        self.bus = [self]
         self.stuck = set()
         self.capabilities = api.CAN_CAPTURE | api.CAN_STREAM
         self.says_rate = True
@@ -54,6 +56,10 @@ class FakeCamera:
     def unplug(self):
         self.failure = errno.ENODEV
         self.frames.put(None)
+
+    @property
+    def load(self):
+        return self.size[0] * self.size[1] * self.rate
 
     def value(self, control):
         return self.controls[control][4]
@@ -165,8 +171,8 @@ class FakeNode:
         return memoryview(self.buffers[offset >> 20])[:length]
 
     def stream_on(self, record):
-        width, height = self.camera.size
-        if width * height * self.camera.rate > self.camera.room:
+        others = [camera for camera in self.camera.bus if camera.streaming and camera is not self.camera]
+        if sum(camera.load for camera in (self.camera, *others)) > self.camera.room:
             raise fault(errno.ENOSPC)
         self.camera.streaming = True
 
