@@ -4,7 +4,7 @@ Pixels are summed in cells of 2x2 and cells in apertures of 2x2, because a light
 keeps most of its signal-to-noise ratio in a 4x4 sum, at a quarter of the work.
 """
 
-from libc.stdint cimport int8_t, int16_t, uint8_t, uint16_t
+from libc.stdint cimport int8_t, int16_t, int32_t, uint8_t, uint16_t
 from libc.string cimport memcpy
 
 
@@ -30,34 +30,133 @@ cdef void _difference_row(
         out[j] = <int8_t>_clipped(<int16_t>(new - old), 63)
 
 
+cdef void _moved_row(
+    const uint16_t* now0,
+    const uint16_t* now1,
+    const uint16_t* old0,
+    const uint16_t* old1,
+    const int16_t* down,
+    const int16_t* right,
+    int32_t move_down,
+    int32_t move_right,
+    int8_t* out,
+    Py_ssize_t columns,
+) noexcept nogil:
+    cdef Py_ssize_t j
+    cdef int32_t change
+    for j in range(columns - 1):
+        change = <int32_t>now0[j] + now0[j + 1] + now1[j] + now1[j + 1]
+        change -= <int32_t>old0[j] + old0[j + 1] + old1[j] + old1[j + 1]
+        change += (down[j] * move_down + right[j] * move_right) >> 8
+        change = 63 if change > 63 else change
+        out[j] = <int8_t>(-63 if change < -63 else change)
+
+
 cdef void _alternation_row(const int8_t* now, const int8_t* old, int16_t* total, Py_ssize_t columns) noexcept nogil:
     cdef Py_ssize_t j
     for j in range(columns - 1):
         total[j] = <int16_t>(total[j] - (<int16_t>(now[j] * old[j]) >> 2))
 
 
-def sum_cells(const uint8_t[:, ::1] image, uint16_t[:, ::1] cells):
-    cdef Py_ssize_t rows = cells.shape[0], columns = cells.shape[1], i
+def sum_cells(const uint8_t[:, ::1] image, uint16_t[:, ::1] cells, Py_ssize_t before, Py_ssize_t after):
+    cdef Py_ssize_t rows = cells.shape[0] - before - after, columns = cells.shape[1] - before - after, i, j
+    cdef Py_ssize_t whole = cells.shape[1] * sizeof(uint16_t)
+    cdef uint16_t* row
     with nogil:
         for i in range(rows):
-            _cell_row(&image[2 * i, 0], &image[2 * i + 1, 0], &cells[i, 0], columns)
+            row = &cells[before + i, 0]
+            _cell_row(&image[2 * i, 0], &image[2 * i + 1, 0], row + before, columns)
+            for j in range(before):
+                row[j] = row[before]
+            for j in range(before + columns, before + columns + after):
+                row[j] = row[before + columns - 1]
+        for i in range(before):
+            memcpy(&cells[i, 0], &cells[before, 0], whole)
+        for i in range(before + rows, before + rows + after):
+            memcpy(&cells[i, 0], &cells[before + rows - 1, 0], whole)
 
 
 def accumulate(
-    const uint8_t[:, ::1] image,
-    uint16_t[:, ::1] cells,
+    const uint16_t[:, ::1] cells,
     const uint16_t[:, ::1] lagged,
+    const int16_t[:, ::1] down,
+    const int16_t[:, ::1] right,
+    int move_down,
+    int move_right,
     int8_t[:, ::1] difference,
     const int8_t[:, ::1] lagged_difference,
     int16_t[:, ::1] total,
+    Py_ssize_t before,
 ):
-    cdef Py_ssize_t rows = cells.shape[0], columns = cells.shape[1], i
+    cdef Py_ssize_t rows = total.shape[0], columns = total.shape[1], i, k
     with nogil:
-        _cell_row(&image[0, 0], &image[1, 0], &cells[0, 0], columns)
         for i in range(rows - 1):
-            _cell_row(&image[2 * i + 2, 0], &image[2 * i + 3, 0], &cells[i + 1, 0], columns)
-            _difference_row(&cells[i, 0], &cells[i + 1, 0], &lagged[i, 0], &lagged[i + 1, 0], &difference[i, 0], columns)
+            k = before + i
+            if move_down == 0 and move_right == 0:
+                _difference_row(
+                    &cells[k, before],
+                    &cells[k + 1, before],
+                    &lagged[k, before],
+                    &lagged[k + 1, before],
+                    &difference[i, 0],
+                    columns,
+                )
+            else:
+                _moved_row(
+                    &cells[k, before],
+                    &cells[k + 1, before],
+                    &lagged[k, before],
+                    &lagged[k + 1, before],
+                    &down[i, 0],
+                    &right[i, 0],
+                    move_down,
+                    move_right,
+                    &difference[i, 0],
+                    columns,
+                )
             _alternation_row(&difference[i, 0], &lagged_difference[i, 0], &total[i, 0], columns)
+
+
+def shift_moments(
+    const uint16_t[:, ::1] cells,
+    const int16_t[:, ::1] reference,
+    const int16_t[:, ::1] down,
+    const int16_t[:, ::1] right,
+    Py_ssize_t before,
+    Py_ssize_t step,
+    float[:, :, ::1] moments,
+):
+    cdef Py_ssize_t rows = moments.shape[0], columns = moments.shape[1], i, j, a, b
+    cdef Py_ssize_t high = reference.shape[0] // rows, wide = reference.shape[1] // columns
+    cdef const uint16_t* top
+    cdef const uint16_t* bottom
+    cdef const int16_t* old
+    cdef const int16_t* gx
+    cdef const int16_t* gy
+    cdef int32_t change, x, y, d
+    with nogil:
+        moments[:, :, :] = 0
+        for a in range(rows):
+            i = a * high
+            while i < (a + 1) * high:
+                for b in range(columns):
+                    top = &cells[before + i, before + b * wide]
+                    bottom = &cells[before + i + 1, before + b * wide]
+                    old = &reference[i, b * wide]
+                    gx = &right[i, b * wide]
+                    gy = &down[i, b * wide]
+                    x = 0
+                    y = 0
+                    d = 0
+                    for j in range(wide):
+                        change = <int32_t>top[j] + top[j + 1] + bottom[j] + bottom[j + 1] - old[j]
+                        x += gx[j] * change
+                        y += gy[j] * change
+                        d += change
+                    moments[a, b, 0] += <float>x
+                    moments[a, b, 1] += <float>y
+                    moments[a, b, 2] += <float>d
+                i += step
 
 
 def aperture_series(
@@ -123,10 +222,10 @@ def cut_patches(
 
 def best_runs(
     const float[:, ::1] projection,
-    const float[::1] sums,
-    const float[::1] squares,
+    const float[:, ::1] sums,
+    const float[:, ::1] squares,
     Py_ssize_t step,
-    Py_ssize_t frames,
+    const float[::1] frames,
     float least,
     float[::1] gain,
     Py_ssize_t[::1] start,
@@ -143,19 +242,19 @@ def best_runs(
             light[c] = 0
             for g in range(starts - step):
                 product = projection[c, g]
-                total = sums[g]
-                square = squares[g]
+                total = sums[c, g]
+                square = squares[c, g]
                 k = 1
                 h = g + step
                 while h < starts:
                     product += projection[c, h]
-                    total += sums[h]
-                    square += squares[h]
+                    total += sums[c, h]
+                    square += squares[c, h]
                     k += 1
                     h += step
                     if product > 0:
-                        norm = square - total * total / frames
-                        norm = norm if norm > least else least
+                        norm = square - total * total / frames[c]
+                        norm = norm if norm > least * frames[c] else least * frames[c]
                         value = product * product / norm
                         if value > gain[c]:
                             gain[c] = value

@@ -160,7 +160,8 @@ class Flash:
 
     `u`, `v` in pixels with standard deviation `sigma` per axis; `score` is the log-likelihood ratio against noise;
     `phase` is the start of the pattern modulo its period in seconds; `amplitude` in grey levels;
-    `saturated` says that the light clips the sensor, so that its centroid leans on the flanks.
+    `saturated` says that the light clips the sensor, so that its centroid leans on the flanks; `covariance` is that of
+    (u, v) in px^2 as (uu, uv, vv); `reflection` is the probability that it is another flash's reflection.
     """
 
     u: float
@@ -170,6 +171,8 @@ class Flash:
     phase: float = 0.0
     amplitude: float = 0.0
     saturated: bool = False
+    covariance: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    reflection: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -108,20 +108,22 @@ def matches(flashes, lights, within=2.0):
 def test_the_accumulation_kernel_equals_its_numpy_reference(rows, columns, seed):
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (2 * rows + 1, 2 * columns + 1), dtype=np.uint8)
-    lagged = rng.integers(0, 1021, (rows, columns), dtype=np.uint16)
+    lagged = rng.integers(0, 1021, (rows + 8, columns + 8), dtype=np.uint16)
     before = rng.integers(-63, 64, (rows, columns), dtype=np.int8)
-    results = []
-    for module in (kernels, reference):
-        cells = np.zeros((rows, columns), np.uint16)
-        difference = np.zeros((rows, columns), np.int8)
-        total = np.ones((rows, columns), np.int16)
-        module.accumulate(image, cells, lagged, difference, before, total)
-        results.append((cells, difference, total))
-        alone = np.zeros_like(cells)
-        module.sum_cells(image, alone)
-        np.testing.assert_array_equal(alone, cells)
-    for left, right in zip(*results, strict=True):
-        np.testing.assert_array_equal(left, right)
+    down, right = rng.integers(-1000, 1000, (2, rows, columns), dtype=np.int16)
+    for move in ((0, 0), (-120, 300)):
+        results = []
+        for module in (kernels, reference):
+            cells = np.zeros((rows + 8, columns + 8), np.uint16)
+            difference = np.zeros((rows, columns), np.int8)
+            total = np.ones((rows, columns), np.int16)
+            module.sum_cells(image, cells, 3, 5)
+            module.accumulate(cells, lagged, down, right, *move, difference, before, total, 3)
+            moments = np.empty((2, 2, 3), np.float32)
+            module.shift_moments(cells, down, right, down, 3, 2, moments)
+            results.append((cells, difference, total, moments))
+        for left, other in zip(*results, strict=True):
+            np.testing.assert_allclose(left, other, rtol=1e-5, atol=4.0)
 
 
 @settings(deadline=None, max_examples=20)
@@ -132,7 +134,8 @@ def test_light_curves_patches_and_runs_equal_their_numpy_references(seed):
     order = rng.permutation(7)[:5].astype(np.intp)
     rows, columns = rng.integers(3, 12, 4).astype(np.intp), rng.integers(3, 14, 4).astype(np.intp)
     projection = rng.normal(size=(4, 90)).astype(np.float32)
-    sums, squares = (3 + rng.random((2, 90))).astype(np.float32)
+    sums, squares = (3 + rng.random((2, 4, 90))).astype(np.float32)
+    frames = rng.integers(60, 97, 4).astype(np.float32)
     image = rng.integers(0, 256, (30, 40), dtype=np.uint8)
     results = []
     for module in (kernels, reference):
@@ -142,7 +145,7 @@ def test_light_curves_patches_and_runs_equal_their_numpy_references(seed):
         module.cut_patches(image, rows, columns, patches)
         gain, light = np.empty((2, 4), np.float32)
         start, periods = np.empty((2, 4), np.intp)
-        module.best_runs(projection, sums, squares, 25, 96, 1.0, gain, start, periods, light)
+        module.best_runs(projection, sums, squares, 25, frames, 0.01, gain, start, periods, light)
         results.append((values, levels, patches, gain, start, periods, light))
     for left, right in zip(*results, strict=True):
         np.testing.assert_allclose(left, right, rtol=2e-5, atol=2e-3)
@@ -250,7 +253,8 @@ def test_detect_resets_and_streaming_gives_the_same(busy):
 def test_the_numpy_kernels_find_the_same(busy, monkeypatch):
     _, frames, times = busy
     compiled = FlashDetector().detect(frames[:75], times[:75])
-    monkeypatch.setattr("robotd.vision.blink.kernels", reference)
+    for module in ("blink", "matching", "shake"):
+        monkeypatch.setattr(f"robotd.vision.{module}.kernels", reference)
     plain = FlashDetector().detect(frames[:75], times[:75])
     assert len(plain) == len(compiled)
     for left, right in zip(plain, compiled, strict=True):
@@ -311,7 +315,7 @@ def test_a_rolling_shutter_is_undone_in_the_phase():
     row_time = 0.03 / SIZE[0]
     labels = [Light(40.0, 12.0, 60.0, start=-0.5), Light(100.0, 106.0, 60.0, start=-0.5)]
     frames, times = shoot(labels, 4.0, drop=0.0, jitter=0.0, row_time=row_time)
-    flashes = FlashDetector(FlashConfig(row_time_s=row_time)).detect(frames, times)
+    flashes = FlashDetector(FlashConfig(row_time_s=row_time, max_reflection=1.0)).detect(frames, times)
     assert [flash.phase for flash in flashes] == pytest.approx([0.5, 0.5], abs=0.02)
 
 

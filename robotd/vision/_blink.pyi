@@ -1,14 +1,27 @@
 import numpy as np
 from numpy.typing import NDArray
 
-def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint16]) -> None: ...
+def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint16], before: int, after: int) -> None: ...
 def accumulate(
-    image: NDArray[np.uint8],
     cells: NDArray[np.uint16],
     lagged: NDArray[np.uint16],
+    down: NDArray[np.int16],
+    right: NDArray[np.int16],
+    move_down: int,
+    move_right: int,
     difference: NDArray[np.int8],
     lagged_difference: NDArray[np.int8],
     total: NDArray[np.int16],
+    before: int,
+) -> None: ...
+def shift_moments(
+    cells: NDArray[np.uint16],
+    reference: NDArray[np.int16],
+    down: NDArray[np.int16],
+    right: NDArray[np.int16],
+    before: int,
+    step: int,
+    moments: NDArray[np.float32],
 ) -> None: ...
 def aperture_series(
     ring: NDArray[np.uint16],
@@ -27,7 +40,7 @@ def best_runs(
     sums: NDArray[np.float32],
     squares: NDArray[np.float32],
     step: int,
-    frames: int,
+    frames: NDArray[np.float32],
     least: float,
     gain: NDArray[np.float32],
     start: NDArray[np.intp],

@@ -4,11 +4,13 @@ A label's light is a spot of about one pixel sigma, a few grey levels to white, 
 from an unknown start and for an unknown number of periods. Three steps of rising cost find it:
 
 1. Every frame: 2x2 cells are kept in a ring of some seconds. With D(t) the change of a 4x4 aperture over a lag of half
-   a flash interval, -D(t) D(t - lag) is added up. It is positive where brightness goes up and down in the pattern's
-   own rhythm, and averages out under noise, slower or faster blinking and passing people.
+   a flash interval, less what the camera's own shaking explains, -D(t) D(t - lag) is added up. It is positive where
+   brightness goes up and down in the pattern's own rhythm, and averages out under noise, slower or faster blinking and
+   passing people.
 2. Every half second: apertures in which that sum stands out from their neighbourhood (constant false alarm rate).
-3. Only there: the aperture-minus-ring light curve is compared with every start and number of periods, by a generalised
-   likelihood ratio against noise and against steady blinking at other rates.
+3. Only there: the aperture-minus-ring light curve is compared with every start and number of periods (`matching`).
+   That is a sequential test: it is repeated as frames arrive and decides as soon as its likelihood ratio passes the
+   bound that keeps the false alarms of noise below a stated number per hour (Wald's bound, over all tests made).
 
 What passes becomes a track, whose amplitude image grows with every further period and is fitted when asked for.
 """
@@ -25,7 +27,10 @@ from numpy.typing import NDArray
 
 from ..bind import ranged
 from ..records import Flash
-from .pattern import FlashPattern, Template
+from .matching import Matcher, Matches
+from .mirror import Lamp, reflected
+from .pattern import FlashPattern
+from .shake import Shake
 from .spot import Spot, fit_spot, grey_difference, light_table
 
 try:
@@ -39,11 +44,15 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
-_RING = 96  # frames kept; at 320x240 cells of 2 bytes 14.7 MB
+_RING = 96  # frames kept; at 328x248 cells of 2 bytes 15.6 MB
 _BLOCK = 32  # frames whose alternation fits into 16 bits: 32 * 63 * 63 / 4 < 2^15
+_BLOCK_LIMIT = 1500
 _TILE = (24, 32)  # cells over which the false alarm rate is held constant
 _BEFORE, _AFTER = 3, 5  # cells around an aperture's first one that its ring needs: 8x8 in all
-_STARTS_PER_SECOND = 50  # grid of possible starts; half a step is 10 ms of a 100 ms flash
+_LONGER = 2.5  # a slow camera's light curves are so much longer than `window_s`, because they have fewer frames
+_SHAKEN_PX = 1.5  # a picture that is further off is not compared
+_STALE_PX = 0.6  # a camera that stays so far off its reference gets another one
+_TESTS_APART = 4  # apertures, and starts per flash, that are about one independent test
 FLOOR_PX = 0.01  # what fits keep in bias however strong the light: sampling, texture, the camera's curve
 _SEPARATION = 3  # cells; nearer lights are one light
 
@@ -59,12 +68,21 @@ class FlashConfig:
     row_time_s: float = ranged(0.0, minimum=0.0, maximum=0.001, doc="time from one row's exposure to the next one's")
     gamma: float = ranged(2.2, minimum=0.3, maximum=4.0, doc="grey = light^(1/gamma); 1 for a linear camera")
     min_alternation: float = ranged(5.5, minimum=1.0, doc="step 2: standard deviations above the neighbourhood")
-    min_score: float = ranged(20.0, minimum=1.0, doc="step 3: log-likelihood ratio against noise")
+    false_alarms_per_hour: float = ranged(1.0, minimum=1e-6, maximum=1e6, doc="step 3: of noise alone, at most")
     min_margin: float = ranged(5.0, minimum=0.0, doc="step 3: log-likelihood ratio against steady blinking")
     max_width_px: float = ranged(2.5, minimum=0.5, doc="a light is no wider (sigma) than this")
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
     steady_hz: tuple[float, ...] = (1.0, 2.0, 5.0, 8.0, 10.0)
     max_candidates: int = ranged(96, minimum=1, maximum=2000, doc="apertures examined at one decision")
+    max_reflection: float = ranged(0.7, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
+
+    def min_score(self, shape: tuple[int, int]) -> float:
+        """Log-likelihood ratio from which a light is accepted in images of this shape (H, W)."""
+        shortest = min(end - start for start, end in self.pattern.on)
+        apertures = shape[0] * shape[1] / 4.0 / _TESTS_APART
+        starts = _TESTS_APART * self.pattern.period / shortest
+        decisions = 3600.0 / self.window_s
+        return float(np.log(max(apertures * starts * decisions / self.false_alarms_per_hour, np.e)))
 
 
 @dataclass(slots=True, eq=False)
@@ -84,25 +102,14 @@ class Track:
     dof: int = 0
     clipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((8, 8), bool))
     base: float = 0.0
+    looks: list[tuple[float, float, float]] = field(default_factory=list)  # time, start of the pattern, its sigma
+    shift: Floats = field(default_factory=lambda: np.zeros(2))  # of the picture while the light was on, weighted
     spot: Spot | None = None
     fitted: float = -1.0
 
 
-@dataclass(slots=True, eq=False)
-class _Matches:
-    """Best match of each light curve: arrays over candidates."""
-
-    score: Floats
-    margin: Floats
-    start: Floats
-    periods: Indices
-    light: Floats
-    variance: Floats
-    regular: NDArray[np.bool_]
-
-
 class FlashDetector:
-    """Streaming detector of flashing lights in one camera that stands still.
+    """Streaming detector of flashing lights in one camera that stands still, or shakes by a pixel.
 
     Feed frames in the order of their time stamps; stamps may be irregular and frames may be missing. Frames that come
     faster than 1.7 times the ring's rate (96 frames a window) are thinned.
@@ -112,7 +119,7 @@ class FlashDetector:
         self.config = config or FlashConfig()
         self._light = light_table(self.config.gamma, 1021)
         self._lag = self.config.pattern.lag
-        self._template = Template(self.config.pattern, self.config.exposure_s)
+        self._matcher = Matcher(self.config.pattern, self.config.exposure_s, self.config.steady_hz)
         self.reset()
 
     def reset(self) -> None:
@@ -120,6 +127,9 @@ class FlashDetector:
         self.tracks: list[Track] = []
         self._ring: NDArray[np.uint16] | None = None
         self._times: deque[tuple[int, float]] = deque(maxlen=_RING)  # number of the frame, its time
+        self._shifts = np.zeros((_RING, 2))
+        self._shift_sum = np.zeros(2)  # places are given where they are in the mean picture
+        self._shake = Shake(_BEFORE)
         self._blocks: deque[tuple[int, NDArray[np.int16]]] = deque()
         self._count = 0
         self._block_frames = 0
@@ -145,18 +155,19 @@ class FlashDetector:
         cells_shape = (frame.shape[0] // 2, frame.shape[1] // 2)
         if self._ring is None:
             self._allocate(cells_shape, t)
-        assert self._ring is not None
-        if self._ring.shape[1:] != cells_shape:
+        if self._total.shape != cells_shape:
             raise ValueError(f"the image size changed within a stream, to {frame.shape}; call reset() first")
         if self._times:
             if t <= self._times[-1][1]:
                 raise ValueError(f"time stamps must increase: {t} came after {self._times[-1][1]}")
             if t - self._times[-1][1] < 0.6 * self.config.window_s / _RING:
                 return False
-        self._accumulate(np.ascontiguousarray(frame), t)
+        frame = np.ascontiguousarray(frame)
+        self._accumulate(frame, t)
         if t - self._decided < self.config.decision_s and self._block_frames < _BLOCK:
             return False
         self._decide(t)
+        self._keep_reference(frame)
         return True
 
     def detect(self, frames: Iterable[NDArray[np.uint8]], times: Sequence[float] | Floats) -> list[Flash]:
@@ -170,20 +181,25 @@ class FlashDetector:
 
     def flashes(self) -> list[Flash]:
         """Every light accepted so far, best first."""
+        seen = [(track, spot) for track in self.tracks if (spot := self.spot(track)) is not None]
+        lamps = [Lamp(np.array(track.looks), spot.peak * spot.width**2, spot.width) for track, spot in seen]
+        config = self.config
         found = []
-        for track in self.tracks:
-            spot = self.spot(track)
-            if spot is None:
+        for (track, spot), reflection in zip(seen, reflected(lamps, config.pattern.period), strict=True):
+            if reflection > config.max_reflection:
                 continue
+            (uu, uv), (_, vv) = spot.covariance + FLOOR_PX**2 * np.eye(2)
             found.append(
                 Flash(
                     u=spot.u,
                     v=spot.v,
-                    sigma=float(np.hypot(spot.sigma, FLOOR_PX)),
+                    sigma=float(np.sqrt(0.5 * (uu + vv))),
                     score=track.score,
-                    phase=(track.start + spot.v * self.config.row_time_s) % self.config.pattern.period,
-                    amplitude=grey_difference(track.base, spot.peak, self.config.gamma),
+                    phase=(track.start + spot.v * config.row_time_s) % config.pattern.period,
+                    amplitude=grey_difference(track.base, spot.peak, config.gamma),
                     saturated=bool(track.clipped.any()),
+                    covariance=(float(uu), float(uv), float(vv)),
+                    reflection=float(reflection),
                 )
             )
         return sorted(found, key=lambda flash: -flash.score)
@@ -204,21 +220,36 @@ class FlashDetector:
             Exposure starts of the first image row in seconds; linear light of the aperture minus that of the ring
             around it; linear light of the ring per cell.
         """
-        assert self._ring is not None
+        numbers, times = self._recent(since)
+        return times, *self._curves(numbers, rows, columns)
+
+    def _recent(self, since: float = -np.inf) -> tuple[Indices, Floats]:
+        """Numbers and times of the frames after `since` within the window."""
         numbers = np.array([number for number, _ in self._times], np.intp)
         times = np.array([t for _, t in self._times])
-        recent = times > max(since, times[-1] - self.config.window_s)
-        numbers, times = numbers[recent], times[recent]
-        values = np.empty((len(rows), len(times)), np.float32)
+        chosen = times > max(since, times[-1] - self._window_s())
+        return numbers[chosen], times[chosen]
+
+    def _curves(self, numbers: Indices, rows: Indices, columns: Indices) -> tuple[Singles, Singles]:
+        assert self._ring is not None
+        values = np.empty((len(rows), len(numbers)), np.float32)
         levels = np.empty_like(values)
         if len(rows):
-            kernels.aperture_series(self._ring, numbers % _RING, rows, columns, self._light, values, levels)
-        return times, values, levels
+            kernels.aperture_series(
+                self._ring, numbers % _RING, rows + _BEFORE, columns + _BEFORE, self._light, values, levels
+            )
+        return values, levels
+
+    def _window_s(self) -> float:
+        """Length of the light curves in seconds: what the ring holds, within limits."""
+        pace = (self._times[-1][1] - self._times[0][1]) / max(len(self._times) - 1, 1)
+        return float(np.clip(0.9 * _RING * pace, self.config.window_s, _LONGER * self.config.window_s))
 
     # ---- each frame --------------------------------------------------------------------------------------------------
 
     def _allocate(self, shape: tuple[int, int], t: float) -> None:
-        self._ring = np.zeros((_RING, *shape), np.uint16)
+        around = _BEFORE + _AFTER
+        self._ring = np.zeros((_RING, shape[0] + around, shape[1] + around), np.uint16)
         depth = int(np.ceil(1.7 * self._lag * _RING / self.config.window_s)) + 2
         self._differences = np.zeros((depth, *shape), np.int8)
         self._total = np.zeros(shape, np.int16)
@@ -227,16 +258,32 @@ class FlashDetector:
 
     def _accumulate(self, frame: NDArray[np.uint8], t: float) -> None:
         assert self._ring is not None
-        cells = self._ring[self._count % _RING]
+        now = self._count % _RING
+        cells = self._ring[now]
+        kernels.sum_cells(frame, cells, _BEFORE, _AFTER)
+        if not self._count:
+            self._shake.refer(frame, np.zeros(2))
+        self._shifts[now] = self._shake.measure(cells)
+        self._shift_sum += self._shifts[now]
         lagged = self._lagged(t)
         depth = len(self._differences)
         difference = self._differences[self._count % depth]
-        if lagged is None:
-            kernels.sum_cells(frame, cells)
+        move = np.zeros(2) if lagged is None else self._shifts[now] - self._shifts[lagged % _RING]
+        if lagged is None or np.abs(move).max() > _SHAKEN_PX:
             difference[:] = 0
         else:
+            right, down = np.rint(256.0 * move).astype(int)
             kernels.accumulate(
-                frame, cells, self._ring[lagged % _RING], difference, self._differences[lagged % depth], self._total
+                cells,
+                self._ring[lagged % _RING],
+                self._shake.down,
+                self._shake.right,
+                down,
+                right,
+                difference,
+                self._differences[lagged % depth],
+                self._total,
+                _BEFORE,
             )
         self._times.append((self._count, t))
         self._count += 1
@@ -263,7 +310,7 @@ class FlashDetector:
         self._total = np.zeros_like(self._total)
         self._block_frames = 0
         self._decided = t
-        while len(self._blocks) * self.config.decision_s > self.config.window_s + self.config.decision_s / 2:
+        while len(self._blocks) * self.config.decision_s > self._window_s() + self.config.decision_s / 2:
             self._window -= self._blocks.popleft()[1]
         if t - self._times[0][1] < 1.4 * self.config.pattern.period:
             return
@@ -273,10 +320,11 @@ class FlashDetector:
         columns = np.concatenate([np.array([track.column for track in self.tracks], np.intp), columns])
         if not len(rows):
             return
-        times, values, _ = self.light_curves(rows, columns)
-        matches = self._match(times, values)
+        numbers, times = self._recent()
+        values, levels = self._curves(numbers, rows, columns)
+        matches = self._matcher.match(times, values, levels, self._shifts[numbers % _RING])
         accepted = (
-            (matches.score >= self.config.min_score)
+            (matches.score >= self.config.min_score((2 * self._total.shape[0], 2 * self._total.shape[1])))
             & (matches.margin >= self.config.min_margin)
             & matches.regular
             & (matches.light > 0.0)
@@ -288,11 +336,38 @@ class FlashDetector:
         for k in fresh:
             self._add(int(rows[k]), int(columns[k]), int(k), matches, t)
 
+    def _keep_reference(self, frame: NDArray[np.uint8]) -> None:
+        """Refer to the latest picture if the camera has settled away from the last reference."""
+        recent = self._shifts[[number % _RING for number, _ in list(self._times)[-8:]]]
+        middle = np.median(recent, axis=0)
+        if np.abs(middle - self._shake.offset).max() > _STALE_PX and np.ptp(recent, axis=0).max() < 0.3:
+            self._shake.refer(frame, self._shifts[self._times[-1][0] % _RING])
+
     def _candidates(self) -> tuple[Indices, Indices]:
         """Apertures whose alternation stands out, strongest first."""
-        frames = sum(count for count, _ in self._blocks)
+        clipped = np.zeros(self._window.shape, np.float32)
+        for _, block in self._blocks:  # because who passes by weighs more in one block than a label in all others
+            clipped += np.clip(block, -_BLOCK_LIMIT, _BLOCK_LIMIT)
         total = self._window.astype(np.float32)
+        stands_out = (total > self._limit(total)) | (clipped > self._limit(clipped))
+        over = np.where(stands_out, np.maximum(total, clipped), np.float32(0.0))
+        width = total.shape[1]
+        over[-1] = over[:, -1] = 0.0
+        for track in self.tracks:
+            over[
+                max(track.row - _SEPARATION, 0) : track.row + _SEPARATION + 1,
+                max(track.column - _SEPARATION, 0) : track.column + _SEPARATION + 1,
+            ] = 0.0
+        peaks = np.flatnonzero((over > 0.0) & (over >= cv2.dilate(over, np.ones((3, 3), np.uint8))))
+        flat = over.ravel()
+        peaks = peaks[np.argsort(-flat[peaks], kind="stable")][: self.config.max_candidates]
+        rows, columns = np.divmod(peaks, width)
+        return np.ascontiguousarray(rows), np.ascontiguousarray(columns)
+
+    def _limit(self, total: Singles) -> Singles:
+        """What the alternation of every aperture must pass: its tile's median and so many spreads more."""
         height, width = total.shape
+        frames = sum(count for count, _ in self._blocks)
         tiles = max(1, height // _TILE[0]), max(1, width // _TILE[1])
         size = height // tiles[0], width // tiles[1]
         blocks = total[: tiles[0] * size[0], : tiles[1] * size[1]].reshape(tiles[0], size[0], tiles[1], size[1])
@@ -303,77 +378,12 @@ class FlashDetector:
         spread = 1.48 * deviation + 2.0 * np.sqrt(frames)
         of_row = np.minimum(np.arange(height) // size[0], tiles[0] - 1)
         of_column = np.minimum(np.arange(width) // size[1], tiles[1] - 1)
-        limit = (middle + self.config.min_alternation * spread).astype(np.float32)[of_row[:, None], of_column]
-        over = np.where(total > limit, total, np.float32(0.0))
-        over[:_BEFORE] = over[-_AFTER:] = 0.0
-        over[:, :_BEFORE] = over[:, -_AFTER:] = 0.0
-        peaks = np.flatnonzero((over > 0.0) & (over >= cv2.dilate(over, np.ones((3, 3), np.uint8))))
-        flat = over.ravel()
-        peaks = peaks[np.argsort(-flat[peaks], kind="stable")][: self.config.max_candidates]
-        rows, columns = np.divmod(peaks, width)
-        if self.tracks:
-            places = np.array([(track.row, track.column) for track in self.tracks])
-            apart = np.hypot(places[:, 0] - rows[:, None], places[:, 1] - columns[:, None])
-            free = apart.min(axis=1) > _SEPARATION
-            rows, columns = rows[free], columns[free]
-        return np.ascontiguousarray(rows), np.ascontiguousarray(columns)
-
-    def _match(self, times: Floats, values: Singles) -> _Matches:
-        """Best start and number of periods of each light curve (N, F), and how much better than the alternatives."""
-        period = self.config.pattern.period
-        step = round(_STARTS_PER_SECOND * period)
-        pitch = period / step
-        starts = times[0] - period + np.arange(int((times[-1] - times[0] + period) / pitch) + 1) * pitch
-        single = self._template(times[None, :] - starts[:, None])
-        y = values - values.mean(axis=1, keepdims=True)
-        frames, places = len(times), len(y)
-        energy = np.einsum("nf,nf->n", y, y).astype(float) + 1e-6
-        projection = y @ single.T
-        sums = single.sum(axis=1)
-        squares = np.einsum("gf,gf->g", single, single)
-        gain, light = np.empty(places, np.float32), np.empty(places, np.float32)
-        start, periods = np.empty(places, np.intp), np.empty(places, np.intp)
-        kernels.best_runs(projection, sums, squares, step, frames, 0.01 * frames, gain, start, periods, light)
-        residual = np.maximum(energy - gain, 1e-6)
-        return _Matches(
-            score=0.5 * frames * np.log(energy / residual),
-            margin=0.5 * frames * np.log(self._steady_residual(times, y, energy) / residual),
-            start=starts[start],
-            periods=periods,
-            light=light.astype(float),
-            variance=residual / frames,
-            regular=self._is_regular(projection, squares, start, periods, light, step),
-        )
-
-    def _steady_residual(self, times: Floats, y: Singles, energy: Floats) -> Floats:
-        """What the best steady blinking (a sine with its third harmonic) leaves of each light curve's energy."""
-        least = energy
-        angle = 2.0 * np.pi * (times - times[0])
-        for hertz in self.config.steady_hz:
-            waves = np.stack([wave(k * hertz * angle) for k in (1, 3) for wave in (np.cos, np.sin)])
-            basis, upper = np.linalg.qr((waves - waves.mean(axis=1, keepdims=True)).T)
-            basis = basis[:, np.abs(np.diag(upper)) > 1e-3 * len(times)]  # aliases of one another at this frame rate
-            least = np.minimum(least, energy - np.sum((y @ basis) ** 2, axis=1))
-        return np.maximum(least, 1e-6)
-
-    @staticmethod
-    def _is_regular(
-        projection: Singles, squares: Singles, start: Indices, periods: Indices, light: Singles, step: int
-    ) -> NDArray[np.bool_]:
-        """Two periods or more must each carry their share: one burst of clutter is no pattern."""
-        enough = 0.3 * squares.max()
-        carrying, missing = np.zeros(len(start), int), np.zeros(len(start), int)
-        for k in range(int(periods.max())):
-            index = np.minimum(start + k * step, len(squares) - 1)
-            counted = (k < periods) & (squares[index] >= enough)
-            share = projection[np.arange(len(start)), index] / np.maximum(squares[index], 1e-6)
-            carrying += counted & (share >= 0.4 * light)
-            missing += counted & (share < 0.2 * light)
-        return np.asarray((carrying >= 2) & (missing == 0))
+        limit = (middle + self.config.min_alternation * spread).astype(np.float32)
+        return np.asarray(limit[of_row[:, None], of_column])
 
     # ---- tracks ------------------------------------------------------------------------------------------------------
 
-    def _add(self, row: int, column: int, k: int, matches: _Matches, t: float) -> None:
+    def _add(self, row: int, column: int, k: int, matches: Matches, t: float) -> None:
         """Start a track on the aperture that is centred best on the light, unless it has a track already."""
         track = self._track(row, column, k, matches, t)
         image = track.numerator[1:7, 1:7]
@@ -390,18 +400,17 @@ class FlashDetector:
         if not len(places) or np.min(np.hypot(places[:, 0] - row, places[:, 1] - column)) > _SEPARATION:
             self.tracks.append(track)
 
-    def _track(self, row: int, column: int, k: int, matches: _Matches, t: float) -> Track:
+    def _track(self, row: int, column: int, k: int, matches: Matches, t: float) -> Track:
         start = float(matches.start[k])
         track = Track(row, column, float(matches.score[k]), start, float(matches.light[k]), float(matches.variance[k]))
         self._grow(track, start, int(matches.periods[k]), t)
         return track
 
     def _is_inside(self, row: int, column: int) -> bool:
-        assert self._ring is not None
-        height, width = map(int, self._ring.shape[1:])
-        return _BEFORE <= row <= height - _AFTER and _BEFORE <= column <= width - _AFTER
+        height, width = self._total.shape
+        return 0 <= row < height - 1 and 0 <= column < width - 1
 
-    def _extend(self, track: Track, k: int, matches: _Matches, t: float) -> None:
+    def _extend(self, track: Track, k: int, matches: Matches, t: float) -> None:
         if matches.score[k] > track.score:
             track.score = float(matches.score[k])
             track.start = float(matches.start[k])
@@ -413,35 +422,46 @@ class FlashDetector:
     def _grow(self, track: Track, start: float, periods: int, t: float) -> None:
         """Add the frames since `track.last` to the amplitude image: per cell the regression of light on the pattern."""
         assert self._ring is not None
-        numbers = np.array([number for number, then in self._times if then > max(track.last, t - self.config.window_s)])
-        times = np.array([then for _, then in self._times if then > max(track.last, t - self.config.window_s)])
-        pattern = self.config.pattern.coverage(times - start, self.config.exposure_s, periods)
-        wave = pattern - pattern.mean()
-        weight = float(wave @ wave)
-        if weight < 2.0:
+        numbers, times = self._recent(track.last)
+        if len(times) < 8:
             return
-        rows = slice(track.row - _BEFORE, track.row + _AFTER)
-        columns = slice(track.column - _BEFORE, track.column + _AFTER)
-        cells = self._ring[numbers % _RING, rows, columns]
+        values, levels = self._curves(numbers, np.array([track.row], np.intp), np.array([track.column], np.intp))
+        shifts = self._shifts[numbers % _RING]
+        rest = self._matcher.cleared(times, values[0], levels[0], shifts, start, periods)
+        if rest.weight < 2.0:
+            return
+        rows = slice(track.row, track.row + _BEFORE + _AFTER)
+        columns = slice(track.column, track.column + _BEFORE + _AFTER)
+        cells = self._ring[numbers[rest.seen] % _RING, rows, columns]
         light = self._light[cells].astype(float)
         mean = light.mean(axis=0)
-        numerator = np.tensordot(wave, light, 1)
+        numerator = np.tensordot(rest.wave, light, 1)
+        explained = np.tensordot(rest.basis, light, 1)
         track.numerator += numerator
-        track.squares += ((light - mean) ** 2).sum(axis=0) - numerator**2 / weight
-        track.weight += weight
-        track.dof += len(times) - 2
+        track.squares += (light**2).sum(axis=0) - (explained**2).sum(axis=0) - numerator**2 / rest.weight
+        track.weight += rest.weight
+        track.dof += len(light) - 1 - len(rest.basis)
         track.clipped |= (cells >= 985).any(axis=0)  # four pixels of which none is far from white
         track.base = float(np.median(mean))
+        track.shift += rest.weight * rest.shift
         track.last = t
+        if rest.sigma < 0.25 * self.config.pattern.period:
+            track.looks.append((float(times.mean()), rest.start % self.config.pattern.period, rest.sigma))
 
     def spot(self, track: Track) -> Spot | None:
         """Where a track's light is, in pixels; None if its image is not that of a small light, as people leave it."""
         if track.fitted != track.last:
             variance = track.squares / max(track.dof, 1) / max(track.weight, 1e-9)
             variance = np.maximum(variance, 0.1 * float(np.median(variance)) + 1e-9)
-            spot = fit_spot(track.numerator / max(track.weight, 1e-9), variance, ~track.clipped, pitch=2)
+            height, width = self._total.shape
+            top, left = max(0, _BEFORE - track.row), max(0, _BEFORE - track.column)
+            inside = np.s_[top : height + _BEFORE - track.row, left : width + _BEFORE - track.column]
+            image = track.numerator / max(track.weight, 1e-9)
+            spot = fit_spot(image[inside], variance[inside], ~track.clipped[inside], pitch=2)
             if spot is not None:
-                u, v = spot.u + 2.0 * (track.column - _BEFORE), spot.v + 2.0 * (track.row - _BEFORE)
+                shift = track.shift / max(track.weight, 1e-9) - self._shift_sum / max(self._count, 1)
+                u = spot.u + 2.0 * (track.column - _BEFORE + left) - shift[0]
+                v = spot.v + 2.0 * (track.row - _BEFORE + top) - shift[1]
                 small = spot.sigma <= self.config.max_sigma_px and spot.width <= self.config.max_width_px
                 spot = replace(spot, u=u, v=v) if small else None
             track.spot = spot

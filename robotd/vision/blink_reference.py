@@ -6,44 +6,91 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint16]) -> None:
-    """Sum 2x2 pixels of `image` (H, W) into `cells` (H // 2, W // 2)."""
-    rows, columns = cells.shape
+def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint16], before: int, after: int) -> None:
+    """Sum 2x2 pixels of `image` (H, W) into `cells`, with `before` and `after` copies of the outermost cells around.
+
+    `cells` is (H // 2 + before + after, W // 2 + before + after).
+    """
+    rows, columns = cells.shape[0] - before - after, cells.shape[1] - before - after
     pixels = image[: 2 * rows, : 2 * columns].astype(np.uint16)
-    cells[:] = pixels.reshape(rows, 2, columns, 2).sum(axis=(1, 3), dtype=np.uint16)
+    cells[:] = np.pad(pixels.reshape(rows, 2, columns, 2).sum(axis=(1, 3), dtype=np.uint16), (before, after), "edge")
 
 
 def accumulate(
-    image: NDArray[np.uint8],
     cells: NDArray[np.uint16],
     lagged: NDArray[np.uint16],
+    down: NDArray[np.int16],
+    right: NDArray[np.int16],
+    move_down: int,
+    move_right: int,
     difference: NDArray[np.int8],
     lagged_difference: NDArray[np.int8],
     total: NDArray[np.int16],
+    before: int,
 ) -> None:
-    """Sum the cells of a frame and add to the alternation of every aperture.
+    """Add a frame to the alternation of every aperture.
 
     Parameters
     ----------
-    image : (H, W) uint8
-    cells : (h, w) uint16, out
-        As of `sum_cells`.
-    lagged : (h, w) uint16
-        Cells of the frame one lag ago.
+    cells, lagged : uint16
+        As of `sum_cells`: of the frame, and of the one a lag ago.
+    down, right : (h, w) int16
+        Change of each aperture per pixel that the camera's picture moves up or left.
+    move_down, move_right : int
+        By how much the picture moved over the lag, in 1/256 px.
     difference : (h, w) int8, out
-        Change of each 2x2-cell aperture over the lag, clipped to +-63; entry [i, j] is the aperture whose first cell
-        is (i, j). The last row and column are left alone.
+        Change of each 2x2-cell aperture over the lag, less what the move explains, clipped to +-63; entry [i, j] is
+        the aperture whose first cell is (i, j). The last row and column are left alone.
     lagged_difference : (h, w) int8
         The same, one lag ago.
     total : (h, w) int16, updated
         Loses floor(difference * lagged_difference / 4).
+    before : int
+        As of `sum_cells`.
     """
-    sum_cells(image, cells)
-    change = cells.astype(np.int16) - lagged.astype(np.int16)
+    rows, columns = total.shape
+    inside = np.s_[before : before + rows, before : before + columns]
+    change = cells[inside].astype(np.int32) - lagged[inside]
     change = change[:-1, :-1] + change[:-1, 1:] + change[1:, :-1] + change[1:, 1:]
+    change += (down[:-1, :-1].astype(np.int32) * move_down + right[:-1, :-1].astype(np.int32) * move_right) >> 8
     difference[:-1, :-1] = np.clip(change, -63, 63)
     product = difference[:-1, :-1].astype(np.int16) * lagged_difference[:-1, :-1]
     total[:-1, :-1] -= product >> 2
+
+
+def shift_moments(
+    cells: NDArray[np.uint16],
+    reference: NDArray[np.int16],
+    down: NDArray[np.int16],
+    right: NDArray[np.int16],
+    before: int,
+    step: int,
+    moments: NDArray[np.float32],
+) -> None:
+    """Sums over tiles from which the shift of a picture against a reference follows.
+
+    Parameters
+    ----------
+    cells : uint16
+        As of `sum_cells`.
+    reference, down, right : (h, w) int16
+        The reference's apertures (sums of 2x2 cells), and their gradients per pixel.
+    before : int
+        As of `sum_cells`.
+    step : int
+        Only every so many rows of a tile count.
+    moments : (R, C, 3) float32, out
+        Per tile the sums of right * d, down * d and d, with the change d of the apertures.
+    """
+    height, width = reference.shape
+    rows, columns = moments.shape[:2]
+    high, wide = height // rows, width // columns
+    part = cells[before : before + height + 1, before : before + width + 1].astype(np.int64)
+    change = part[:-1, :-1] + part[1:, :-1] + part[:-1, 1:] + part[1:, 1:] - reference
+    for a in range(rows):
+        for b in range(columns):
+            tile = np.s_[a * high : (a + 1) * high : step, b * wide : (b + 1) * wide]
+            moments[a, b] = [(right[tile] * change[tile]).sum(), (down[tile] * change[tile]).sum(), change[tile].sum()]
 
 
 def aperture_series(
@@ -98,7 +145,7 @@ def best_runs(
     sums: NDArray[np.float32],
     squares: NDArray[np.float32],
     step: int,
-    frames: int,
+    frames: NDArray[np.float32],
     least: float,
     gain: NDArray[np.float32],
     start: NDArray[np.intp],
@@ -111,14 +158,15 @@ def best_runs(
     ----------
     projection : (N, G) float32
         Scalar product of each centred light curve with one period of the pattern from each start.
-    sums, squares : (G,) float32
-        Sum and sum of squares of that period's samples.
+    sums, squares : (N, G) float32
+        Sum and sum of squares of that period's samples, over the frames that count for the light curve.
     step : int
         Starts from one period to the next.
-    frames : int
-        Samples of a light curve.
+    frames : (N,) float32
+        Frames that count for each light curve.
     least : float
-        Least energy of a centred pattern that is divided by, so that patterns which hardly touch the window do not win.
+        Least energy per frame of a centred pattern that is divided by, so that patterns which hardly touch the window
+        do not win.
     gain, start, periods, light : (N,), out
         Energy explained, index of the start, number of periods, and light of the source.
     """
@@ -132,10 +180,10 @@ def best_runs(
     while rest > step:
         rest -= step
         product = product[:, :rest] + projection[:, number * step :]
-        total = total[:rest] + sums[number * step :]
-        square = square[:rest] + squares[number * step :]
+        total = total[:, :rest] + sums[:, number * step :]
+        square = square[:, :rest] + squares[:, number * step :]
         number += 1
-        norm = np.maximum(square - total * total / frames, least)
+        norm = np.maximum(square - total * total / frames[:, None], least * frames[:, None])
         value = np.where(product > 0, product * product / norm, 0)
         top = np.argmax(value, axis=1)
         rows = np.arange(len(top))
@@ -143,4 +191,4 @@ def best_runs(
         gain[better] = value[rows, top][better]
         start[better] = top[better]
         periods[better] = number
-        light[better] = (product[rows, top] / norm[top])[better]
+        light[better] = (product[rows, top] / norm[rows, top])[better]

@@ -49,9 +49,9 @@ def fit_spot(image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: i
 
     Parameters
     ----------
-    image, variance : (K, K) array
+    image, variance : (K, L) array
         Amplitude per cell and its variance.
-    valid : (K, K) bool array
+    valid : (K, L) bool array
         False where a cell must not count, for instance because it was clipped.
     pitch : int
         Pixels per cell; a cell is the mean of pitch x pitch pixels.
@@ -68,11 +68,10 @@ def fit_spot(image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: i
     Levenberg-Marquardt on peak, u, v, log width and constant. The Gaussian is evaluated at pixel centres and averaged
     over the cell.
     """
-    size = image.shape[0]
     weights = np.where(valid, 1.0 / np.maximum(variance, 1e-12), 0.0)
     if np.count_nonzero(weights) < 12:
         return None
-    pixels = np.arange(size * pitch, dtype=float)
+    pixels = np.arange(image.shape[1] * pitch, dtype=float), np.arange(image.shape[0] * pitch, dtype=float)
     parameters = _start(image, valid, weights, pitch)
     damping = 1e-3
     residuals, jacobian = _model(parameters, image, pixels, pitch)
@@ -97,8 +96,7 @@ def fit_spot(image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: i
         else:
             damping *= 8.0
     peak, u, v, log_width, _ = parameters
-    limit = size * pitch - 1.0
-    if peak <= 0.0 or not (0.0 < u < limit and 0.0 < v < limit):
+    if peak <= 0.0 or not (0.0 < u < image.shape[1] * pitch - 1.0 and 0.0 < v < image.shape[0] * pitch - 1.0):
         return None
     normal = (jacobian * weights.ravel()) @ jacobian.T
     scale: float = max(1.0, cost / max(1, cells - 5))
@@ -113,28 +111,28 @@ def _start(image: Floats, valid: NDArray[np.bool_], weights: Floats, pitch: int)
     raised = np.where(valid, image - constant, 0.0)
     top = max(float(raised.max()), 1e-9)
     mass = np.where(valid, np.where(raised > 0.3 * top, raised, 0.0), top)
-    centres = (np.arange(image.shape[0]) + 0.5) * pitch - 0.5
-    total = float(mass.sum())
-    u = float((mass.sum(axis=0) * centres).sum() / total)
-    v = float((mass.sum(axis=1) * centres).sum() / total)
+    rows, columns = ((np.arange(size) + 0.5) * pitch - 0.5 for size in image.shape)
+    total = max(float(mass.sum()), 1e-12)
+    u = float((mass.sum(axis=0) * columns).sum() / total)
+    v = float((mass.sum(axis=1) * rows).sum() / total)
     peak = top * (1.3 if np.all(valid) else 2.0)
     return np.array([peak, u, v, np.log(1.1), constant])
 
 
-def _model(parameters: Floats, image: Floats, pixels: Floats, pitch: int) -> tuple[Floats, Floats]:
-    """Residuals (K, K) and the model's derivatives (5, K * K)."""
+def _model(parameters: Floats, image: Floats, pixels: tuple[Floats, Floats], pitch: int) -> tuple[Floats, Floats]:
+    """Residuals (K, L) and the model's derivatives (5, K * L)."""
     peak, u, v, log_width, constant = parameters
     width = np.exp(log_width)
 
-    def profile(centre: float) -> tuple[Floats, Floats, Floats]:
-        x = (pixels - centre) / width
+    def profile(places: Floats, centre: float) -> tuple[Floats, Floats, Floats]:
+        x = (places - centre) / width
         bell = np.exp(-0.5 * x * x)
         parts = np.stack([bell, bell * x / width, bell * x * x])
         value, shift, widen = parts.reshape(3, -1, pitch).mean(axis=2)
         return value, shift, widen
 
-    gu, du, wu = profile(u)
-    gv, dv, wv = profile(v)
+    gu, du, wu = profile(pixels[0], u)
+    gv, dv, wv = profile(pixels[1], v)
     spot = np.outer(gv, gu)
     jacobian = np.stack(
         [

@@ -1,0 +1,280 @@
+"""Which light curves follow the pattern: a generalised likelihood ratio test that people and shake do not upset.
+
+For every start and number of periods the pattern's best amplitude is compared with darkness, with noise of unknown
+strength. Frames in which somebody stands before the place, or which fit neither, count for neither; what the shift of
+the picture explains is taken off first. Steady blinking at other rates is a rival hypothesis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import blink_reference
+from .pattern import FlashPattern, Template
+
+try:
+    from . import _blink as kernels
+except ImportError:  # built with ROBOTD_NO_EXTENSIONS=1
+    kernels = blink_reference  # type: ignore[misc]
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+_LEAST = 0.01  # energy per frame below which a pattern hardly touches the window
+_HIDDEN = 0.02  # relative change of the light around a place that says somebody stands before it,
+_SPREADS = 5.0  # beyond so many of its usual spreads
+_OUTLIER = 4.5  # spreads of the residual
+_MOST_OUTLIERS = 0.12  # of the frames that count: with more, it is not the pattern that is there
+
+
+@dataclass(slots=True, eq=False)
+class Matches:
+    """Best match of each light curve: arrays over places.
+
+    `score` and `margin` are log-likelihood ratios against noise and against steady blinking; `start` in seconds,
+    `light` in the curves' unit, `variance` of the curve about the match; `regular`: several periods carry the pattern
+    and none lacks it; `frames` that counted.
+    """
+
+    score: Floats
+    margin: Floats
+    start: Floats
+    periods: Indices
+    light: Floats
+    variance: Floats
+    regular: NDArray[np.bool_]
+    frames: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cleared:
+    """Frames that show a known light: `seen` (F,) of them, of which M are.
+
+    `wave` (M,) is the pattern less what `basis` (B, M, orthonormal) explains of it, `weight` its energy; `shift` (2,)
+    is the picture's while the light was on; `start` and `sigma` are of the pattern in seconds.
+    """
+
+    seen: NDArray[np.bool_]
+    wave: Floats
+    weight: float
+    basis: Floats
+    shift: Floats
+    start: float
+    sigma: float
+
+
+class Matcher:
+    """Compares light curves with one pattern."""
+
+    def __init__(self, pattern: FlashPattern, exposure: float, steady_hz: tuple[float, ...]) -> None:
+        self._pattern = pattern
+        self._exposure = exposure
+        self._template = Template(pattern, exposure)
+        self._steady_hz = steady_hz
+        shortest = min(end - start for start, end in pattern.on)
+        self._step = max(8, int(np.ceil(pattern.period / min(0.02, max(0.004, 0.3 * shortest)))))
+
+    def match(self, times: Floats, values: Singles, levels: Singles, shifts: Floats) -> Matches:
+        """Match N light curves.
+
+        Parameters
+        ----------
+        times : (F,) array, s
+        values, levels : (N, F) arrays
+            Light of each place, and of what is around it.
+        shifts : (F, 2) array
+            Shift of the picture in px.
+        """
+        seen = self._seen(levels)
+        starts, single = self._starts(times)
+        basis = _moved(shifts)
+        found, residual = self._search(times, values, seen, starts, single, basis)
+        spread = _spread(residual, seen)
+        partial = 0.35 * found.light[:, None]  # what a frame that is half exposed to a flash may be wrong by
+        inliers = seen & (np.abs(residual) <= _OUTLIER * spread[:, None] + partial)
+        lost = seen.sum(axis=1) - inliers.sum(axis=1)
+        doubtful = np.flatnonzero(lost > 0)
+        if len(doubtful):
+            again, _ = self._search(times, values[doubtful], inliers[doubtful], starts, single, basis)
+            for name in Matches.__slots__:
+                getattr(found, name)[doubtful] = getattr(again, name)
+        found.regular &= lost <= _MOST_OUTLIERS * seen.sum(axis=1)
+        return found
+
+    def cleared(
+        self,
+        times: Floats,
+        values: Singles,
+        levels: Singles,
+        shifts: Floats,
+        start: float,
+        periods: int,
+    ) -> Cleared:
+        """Choose the frames (F,) of a known light that show it, and what its image is regressed on.
+
+        Parameters
+        ----------
+        times, values, levels, shifts
+            As of `match`, of one place.
+        start, periods
+            Its best match.
+        """
+        seen = self._seen(levels[None])[0]
+        wave = self._pattern.coverage(times - start, self._exposure, periods)
+        dark = float(np.median(values[seen & (wave < 0.01)])) if np.any(seen & (wave < 0.01)) else 0.0
+        lit = values[seen & (wave > 0.9)] if np.any(seen & (wave > 0.9)) else values[seen & (wave > 0.4)]
+        light = float(np.median(lit)) - dark if len(lit) else 0.0
+        residual = values - light * wave - dark
+        spread = _spread(residual[None].astype(np.float32), seen[None])[0]
+        seen &= np.abs(residual) <= _OUTLIER * spread + 0.35 * abs(light)
+        basis = np.linalg.qr(_moved(shifts[seen]).astype(float))[0].T
+        wave = wave[seen]
+        on = wave.sum()
+        shift = wave @ shifts[seen] / on if on > 0.0 else np.zeros(2)
+        wave = wave - (basis @ wave) @ basis
+        found, sigma = self._refined(times[seen], values[seen].astype(float), start, periods, basis)
+        return Cleared(seen, wave, float(wave @ wave), basis, shift, found, sigma)
+
+    def _refined(self, times: Floats, values: Floats, start: float, periods: int, basis: Floats) -> tuple[float, float]:
+        """Start of one run to a few milliseconds, and its standard deviation."""
+        if len(times) < 8:
+            return start, np.inf
+        reach = self._pattern.period / self._step
+        offsets = np.linspace(-1.5 * reach, 1.5 * reach, 31)
+        waves = np.stack([self._pattern.coverage(times - start - o, self._exposure, periods) for o in offsets])
+        waves -= (waves @ basis.T) @ basis
+        y = values - (basis @ values) @ basis
+        energy = np.maximum(np.einsum("of,of->o", waves, waves), 1e-6)
+        product = waves @ y
+        gain = np.where(product > 0.0, product**2 / energy, 0.0)
+        variance = max(float(y @ y - gain.max()), 1e-6) / max(len(times) - 2 - len(basis), 1)
+        weight = np.exp(np.maximum((gain - gain.max()) / (2.0 * variance), -60.0))
+        mean = float(weight @ offsets / weight.sum())
+        sigma = float(np.sqrt(weight @ (offsets - mean) ** 2 / weight.sum() + (offsets[1] - offsets[0]) ** 2 / 12.0))
+        return start + mean, sigma
+
+    def _starts(self, times: Floats) -> tuple[Floats, Singles]:
+        period = self._pattern.period
+        pitch = period / self._step
+        starts = times[0] - period + np.arange(int((times[-1] - times[0] + period) / pitch) + 1) * pitch
+        return starts, self._template(times[None, :] - starts[:, None])
+
+    @staticmethod
+    def _seen(levels: Singles) -> NDArray[np.bool_]:
+        usual = np.median(levels, axis=1, keepdims=True)
+        away = np.abs(levels - usual)
+        spread = 1.48 * np.median(away, axis=1, keepdims=True)
+        return np.asarray(away <= _SPREADS * spread + _HIDDEN * usual + 0.15)
+
+    def _search(
+        self,
+        times: Floats,
+        values: Singles,
+        seen: NDArray[np.bool_],
+        starts: Floats,
+        single: Singles,
+        basis: Singles,
+    ) -> tuple[Matches, Singles]:
+        """Best match over all starts and numbers of periods, and what it leaves of every frame."""
+        weights = seen.astype(np.float32)
+        frames = np.maximum(weights.sum(axis=1), 1.0).astype(np.float32)
+        y = weights * _without(values, weights, basis)
+        energy = np.einsum("nf,nf->n", y, y).astype(float) + 1e-6
+        places = len(y)
+        projection: Singles = np.asarray(y @ single.T, np.float32)
+        sums = weights @ single.T
+        squares = weights @ (single * single).T
+        gain, light = np.empty(places, np.float32), np.empty(places, np.float32)
+        start, periods = np.empty(places, np.intp), np.empty(places, np.intp)
+        kernels.best_runs(projection, sums, squares, self._step, frames, _LEAST, gain, start, periods, light)
+        left = np.maximum(energy - gain, 1e-6)
+        wave = np.zeros_like(y)
+        for k in range(int(periods.max(initial=0))):
+            index = np.minimum(start + k * self._step, len(starts) - 1)
+            wave += np.where((k < periods)[:, None], single[index], np.float32(0.0))
+        wave -= (np.einsum("nf,nf->n", wave, weights) / frames)[:, None]
+        residual = (y - light[:, None] * wave) * weights
+        half = 0.5 * (frames.astype(float) - basis.shape[1])
+        matches = Matches(
+            score=half * np.log(energy / left),
+            margin=half * np.log(self._steady_residual(times, y, weights, energy) / left),
+            start=starts[start],
+            periods=periods,
+            light=light.astype(float),
+            variance=left / np.maximum(frames - 2.0, 1.0),
+            regular=self._is_regular(projection, squares, start, periods, light),
+            frames=frames.astype(float),
+        )
+        matches.regular &= frames >= 0.4 * len(times)
+        return matches, residual
+
+    def _steady_residual(self, times: Floats, y: Singles, weights: Singles, energy: Floats) -> Floats:
+        """What the best steady blinking (a sine with its third harmonic) leaves of each light curve's energy."""
+        least = energy
+        angle = 2.0 * np.pi * (times - times[0])
+        for hertz in self._steady_hz:
+            waves = np.stack([np.ones_like(times), *(f(k * hertz * angle) for k in (1, 3) for f in (np.cos, np.sin))])
+            least = np.minimum(least, energy - _explained(y, weights, waves.astype(np.float32)))
+        return np.maximum(least, 1e-6)
+
+    def _is_regular(
+        self, projection: Singles, squares: Singles, start: Indices, periods: Indices, light: Singles
+    ) -> NDArray[np.bool_]:
+        """Two periods or more must each carry their share: one burst of clutter is no pattern."""
+        rows = np.arange(len(start))
+        enough = 0.3 * squares.max(axis=1)
+        carrying, missing = np.zeros(len(start), int), np.zeros(len(start), int)
+        for k in range(int(periods.max(initial=0))):
+            index = np.minimum(start + k * self._step, squares.shape[1] - 1)
+            counted = (k < periods) & (squares[rows, index] >= enough)
+            share = projection[rows, index] / np.maximum(squares[rows, index], 1e-6)
+            carrying += counted & (share >= 0.4 * light)
+            missing += counted & (share < 0.2 * light)
+        return np.asarray((carrying >= 2) & (missing == 0))
+
+
+def _moved(shifts: Floats) -> Singles:
+    """Basis (F, B) of what the shift of the picture does to a place: constant, and if it moved, to second order."""
+    constant = np.ones((len(shifts), 1))
+    centred = shifts - np.median(shifts, axis=0)
+    if np.abs(centred).max(initial=0.0) < 1e-9:
+        return constant.astype(np.float32)
+    u, v = centred.T
+    parts = np.stack([u, v, u * u, u * v, v * v], axis=1)
+    scale = np.maximum(np.abs(parts).max(axis=0), 1e-6)
+    return np.concatenate([constant, parts / scale], axis=1).astype(np.float32)
+
+
+def _without(values: Singles, weights: Singles, basis: Singles) -> Singles:
+    """Values (N, F) less what the basis (F, B) explains of them by weighted least squares."""
+    if basis.shape[1] == 1:
+        mean = np.einsum("nf,nf->n", values, weights) / np.maximum(weights.sum(axis=1), 1.0)
+        return np.asarray(values - mean[:, None])
+    b = basis.astype(float)
+    normal = np.einsum("nf,fa,fb->nab", weights.astype(float), b, b, optimize=True) + 1e-3 * np.eye(b.shape[1])
+    right = (weights * values).astype(float) @ b
+    factors = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    return np.asarray(values - factors @ b.T, np.float32)
+
+
+def _explained(y: Singles, weights: Singles, waves: Singles) -> Floats:
+    """Energy (N,) that waves (B, F) explain of light curves which are zero where their weight is."""
+    products = (waves[:, None, :] * waves[None, :, :]).reshape(-1, waves.shape[1])
+    normal = (weights @ products.T).reshape(len(y), len(waves), len(waves)).astype(float)
+    # because sampled waves may be aliases of one another
+    normal += 1e-3 * np.maximum(weights.sum(axis=1), 1.0)[:, None, None] * np.eye(len(waves))
+    right = (y @ waves.T).astype(float)
+    factors = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    return np.asarray(2.0 * np.einsum("nb,nb->n", factors, right) - np.einsum("na,nab,nb->n", factors, normal, factors))
+
+
+def _spread(residual: Singles, seen: NDArray[np.bool_]) -> Floats:
+    """Robust standard deviation (N,) of what counts."""
+    away = np.where(seen, np.abs(residual), np.nan)
+    with np.errstate(all="ignore"):
+        middle = np.nanmedian(np.where(seen.any(axis=1, keepdims=True), away, 0.0), axis=1)
+    return np.asarray(1.48 * middle + 1e-3)

@@ -1,0 +1,98 @@
+"""Which lights are reflections of others: lights of one label start within milliseconds of each other.
+
+Two labels start together by chance alone. How surprising that would be is weighed against the fraction of reflections
+among the lights, with what a surface usually does to them: it takes light away and blurs. Each of these alone decides
+nothing; a reflection may well be the brighter one where the label is seen at a steep angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_PRIOR, _MOST = 0.1, 0.5  # fraction of lights that are reflections: at first, and at most
+_WEIGHT = 8.0  # lights that the first guess of that fraction counts for
+_ROUNDS = 4
+_STAMPS_S = 0.0015  # what time stamps and rows leave uncertain between two places of a picture
+_COARSE_S = 0.015  # starts known no better than so tell nothing: at 10 frames a second every tenth pair would agree
+_LOSS = (-0.9, 0.8)  # mean and standard deviation of log(reflected light / direct light)
+_LABELS = 1.3  # standard deviation of log(light) between labels, times the square root of 2
+_BLUR = (0.2, 0.2)  # the same of log(width)
+_WIDTHS = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """A light as the fingerprint sees it.
+
+    `starts` is (K, 3): time of a look, start of the pattern in seconds, and its standard deviation; `light` is in any
+    unit of all light in the spot, `width` in px.
+    """
+
+    starts: Floats
+    light: float
+    width: float
+
+
+def reflected(lamps: Sequence[Lamp], period: float) -> Floats:
+    """Probability of every light that it is the reflection of another one.
+
+    Notes
+    -----
+    Expectation maximisation over the fraction of reflections, which is small in most rooms and near one half where
+    the labels hang opposite a window.
+    """
+    count = len(lamps)
+    odds = np.zeros((count, count))  # [i, j]: that i reflects j, against two labels by themselves
+    for i in range(count):
+        for j in range(count):
+            if i != j:
+                odds[i, j] = np.exp(min(_together(lamps[i], lamps[j], period) + _dimmed(lamps[i], lamps[j]), 50.0))
+    prior = _PRIOR
+    probability = np.zeros(count)
+    for _ in range(_ROUNDS):
+        probability = np.zeros(count)
+        for i in np.argsort([_directness(lamp) for lamp in lamps]):
+            # a reflection has no reflections: odds of what was found to be one already count less
+            total = float(odds[i] @ (1.0 - probability)) / max(count - 1, 1) * prior / (1.0 - prior)
+            probability[i] = total / (1.0 + total)
+        prior = float(np.clip((probability.sum() + _WEIGHT * _PRIOR) / (count + _WEIGHT), 0.02, _MOST))
+    return probability
+
+
+def _directness(lamp: Lamp) -> float:
+    """The more, the rather a light is seen directly."""
+    loss = np.log(max(lamp.light, 1e-9)) * -_LOSS[0] / _LOSS[1] ** 2
+    return float(loss - np.log(max(lamp.width, 1e-3)) * _BLUR[0] / _BLUR[1] ** 2)
+
+
+def _together(a: Lamp, b: Lamp, period: float) -> float:
+    """Log-likelihood ratio of the starts: the same, against any."""
+    best = None
+    for t, start, sigma in a.starts:
+        near = b.starts[np.argmin(np.abs(b.starts[:, 0] - t))]
+        if abs(near[0] - t) > 1.5 * period:
+            continue
+        apart = (start - near[1] + 0.5 * period) % period - 0.5 * period
+        variance = sigma**2 + near[2] ** 2 + _STAMPS_S**2
+        if variance > _COARSE_S**2:
+            continue
+        ratio = -0.5 * apart**2 / variance + np.log(period / np.sqrt(2.0 * np.pi * variance))
+        best = ratio if best is None else min(best, ratio)  # because one epoch apart disproves it
+    return -np.inf if best is None else float(best)
+
+
+def _dimmed(a: Lamp, b: Lamp) -> float:
+    """Log-likelihood ratio of the lights' strength and width: a reflects b, against two labels."""
+    light = float(np.log(max(a.light, 1e-9) / max(b.light, 1e-9)))
+    width = float(np.log(max(a.width, 1e-3) / max(b.width, 1e-3)))
+    return _normal(light, *_LOSS) - _normal(light, 0.0, _LABELS) + _normal(width, *_BLUR) - _normal(width, 0.0, _WIDTHS)
+
+
+def _normal(x: float, mean: float, sigma: float) -> float:
+    return float(-0.5 * ((x - mean) / sigma) ** 2 - np.log(sigma))

@@ -1,0 +1,104 @@
+"""How a camera that shakes moved against a reference picture, in pixels, cheaply enough for every frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+try:
+    from . import _blink as kernels
+except ImportError:  # built with ROBOTD_NO_EXTENSIONS=1
+    from . import blink_reference as kernels  # type: ignore[no-redef]
+
+Floats = NDArray[np.float64]
+
+_TILES = (6, 8)
+_ROW_STEP = 4  # every fourth row of apertures is looked at
+_ROUNDS = 5
+_AGREE_PX = 0.1  # a tile that is further off has somebody in it
+_BETTER = 0.9  # a shift must explain the tiles so much better than none
+_QUIET_PX = 0.03  # what noise and passers-by make of a camera that stands still
+
+
+class Shake:
+    """Estimates the picture's shift of every frame against the first one.
+
+    A Gauss-Newton step on 4x4-pixel apertures, as of Lucas and Kanade (1981), in tiles that are weighted by how well
+    they agree with the rest (iteratively reweighted), because people who walk by move part of the picture only. The
+    mean change of a tile does not count: lamps flicker.
+    """
+
+    def __init__(self, before: int) -> None:
+        self._before = before
+        self.offset = np.zeros(2)  # of the reference against the first picture
+        self._moments = np.zeros((*_TILES, 3), np.float32)
+        self._reference = np.zeros((0, 0), np.int16)
+        self.down = np.zeros((0, 0), np.int16)  # change of each aperture per px that the picture moves up
+        self.right = np.zeros((0, 0), np.int16)
+
+    def refer(self, image: NDArray[np.uint8], offset: Floats) -> None:
+        """Take a picture (H, W) as the reference; it is shifted by `offset` (u, v) against the first one."""
+        self.offset = np.asarray(offset, float).copy()
+        height, width = image.shape[0] // 2, image.shape[1] // 2
+        pixels = np.pad(image[: 2 * height, : 2 * width], ((1, 4), (1, 4)), "edge").astype(np.int32)
+        self._reference = np.ascontiguousarray(_fours(_fours(pixels[1:, 1:]).T).T[:height, :width], np.int16)
+        self.down = np.ascontiguousarray(_fours(_edges(pixels)[:, 1:].T).T[:height, :width], np.int16)
+        self.right = np.ascontiguousarray(_fours(_edges(pixels.T)[:, 1:].T)[:height, :width], np.int16)
+        tiles_down, tiles_right = self._tiled(self.down), self._tiled(self.right)
+        self._mean = np.stack([tiles_right.mean(axis=1), tiles_down.mean(axis=1)])
+        tiles_right, tiles_down = tiles_right - self._mean[0][:, None], tiles_down - self._mean[1][:, None]
+        self._xx = (tiles_right**2).sum(axis=1)
+        self._xy = (tiles_right * tiles_down).sum(axis=1)
+        self._yy = (tiles_down**2).sum(axis=1)
+
+    def _tiled(self, picture: NDArray[np.int16]) -> Floats:
+        high, wide = picture.shape[0] // _TILES[0], picture.shape[1] // _TILES[1]
+        tiles = picture[: _TILES[0] * high, : _TILES[1] * wide].reshape(_TILES[0], high, _TILES[1], wide)
+        return tiles[:, ::_ROW_STEP].transpose(0, 2, 1, 3).reshape(_TILES[0] * _TILES[1], -1).astype(float)
+
+    def measure(self, cells: NDArray[np.uint16]) -> Floats:
+        """Shift (u, v) in px of a picture against the first one; the reference's while noise could be the cause."""
+        kernels.shift_moments(cells, self._reference, self.down, self.right, self._before, _ROW_STEP, self._moments)
+        moments = self._moments.reshape(-1, 3).T.astype(float)
+        xd, yd = moments[0] - self._mean[0] * moments[2], moments[1] - self._mean[1] * moments[2]
+        weights = np.ones(len(xd))
+        shift = np.zeros(2)
+        miss = np.zeros(len(xd))
+        scale = _AGREE_PX * (self._xx + self._yy) + 1.0
+        for _ in range(_ROUNDS):
+            a, b, c = float(weights @ self._xx), float(weights @ self._xy), float(weights @ self._yy)
+            p, q = float(weights @ xd), float(weights @ yd)
+            determinant = a * c - b * b
+            if determinant <= 1e-3 * a * c or a * c <= 0.0:
+                return self.offset.copy()
+            shift = np.array([(c * p - b * q) / determinant, (a * q - b * p) / determinant])
+            if np.abs(shift).max() < _QUIET_PX:
+                return self.offset.copy()
+            miss_x = xd - self._xx * shift[0] - self._xy * shift[1]
+            miss_y = yd - self._xy * shift[0] - self._yy * shift[1]
+            miss = np.hypot(miss_x, miss_y) / scale
+            weights = 1.0 / (1.0 + miss**2)
+        still = np.hypot(xd, yd) / scale
+        if np.minimum(miss, 1.0).sum() > _BETTER * np.minimum(still, 1.0).sum():
+            return self.offset.copy()
+        return np.asarray(self.offset - shift)
+
+
+def _fours(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Sums of rows 0..3, 2..5, and so on."""
+    pairs = pixels[: len(pixels) // 2 * 2].reshape(-1, 2, pixels.shape[1]).sum(axis=1)
+    return np.asarray(pairs[:-1] + pairs[1:])
+
+
+def _edges(pixels: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Derivative along the rows of the sums of rows 1..4, 3..6, and so on: what enters less what leaves.
+
+    Differences of neighbouring sums would be far too small on fine texture.
+    """
+    between = 0.5 * (pixels[:-1] + pixels[1:])  # row k is the edge between rows k and k + 1
+    count = (len(between) - 3) // 2
+    return np.asarray(
+        between[4 : 4 + 2 * count : 2][:count] - between[0 : 2 * count : 2][: len(between[4 : 4 + 2 * count : 2])]
+    )

@@ -1,0 +1,127 @@
+"""Patterns learnt from a film, the thesis's detector, reflections, and a camera that shakes."""
+
+import numpy as np
+import pytest
+
+from robotd.errors import InputError
+from robotd.vision.blink import FlashConfig, FlashDetector, FlashPattern
+from robotd.vision.learn_pattern import learn_pattern
+from robotd.vision.mirror import Lamp, reflected
+from robotd.vision.shake import Shake, kernels
+from robotd.vision.thesis_blink import ThesisFlashConfig, ThesisFlashDetector, cost, periods_of
+from tests.flashes.film import add, frames
+from tests.flashes.scenes import Light, Options, scene
+from tests.flashes.score import Score
+from tests.flashes.world import light_of, shelves
+
+SMALL = (192, 144)
+
+
+def test_a_pattern_is_learnt_from_one_label():
+    for period, on in ((1.0, [(0.0, 0.1), (0.2, 0.3)]), (1.2, [(0.0, 0.1), (0.2, 0.3), (0.4, 0.5)])):
+        film, stamps = frames(scene(1, 0, Options(FlashPattern(period, on), SMALL, seconds=8.0, crowd=0.0)))
+        learnt = learn_pattern(film, stamps)
+        assert learnt.period == pytest.approx(period, abs=0.003)
+        assert np.allclose(learnt.on, on, atol=0.03)
+
+
+def test_nothing_is_learnt_where_nothing_repeats():
+    rng = np.random.default_rng(0)
+    noise = rng.normal(90.0, 3.0, (120, 48, 64)).astype(np.uint8)
+    with pytest.raises(InputError, match="nothing in the recording flashes"):
+        learn_pattern(noise, np.arange(120) / 30.0)
+    with pytest.raises(InputError, match="record longer"):
+        learn_pattern(noise[:8], np.arange(8) / 30.0)
+    with pytest.raises(InputError, match="time stamps"):
+        learn_pattern(noise[:100], np.arange(120) / 30.0)
+
+
+def test_the_cost_is_zero_on_a_period_and_limited_elsewhere():
+    assert periods_of(FlashPattern()) == (0.2, 0.6, 1.0)
+    assert np.allclose(cost(np.array([0.2, 0.6, 1.0, 5.0, 0.1]), (0.2, 0.6, 1.0)), [0.0, 0.0, 0.0, 1.0, 1.0])
+
+
+def lamps_of(*looks):
+    return [Lamp(np.array([[1.0, start, 0.003]]), light, width) for start, light, width in looks]
+
+
+def test_a_dim_and_blurred_light_of_the_same_phase_is_a_reflection():
+    probability = reflected(lamps_of((0.3, 100.0, 1.0), (0.301, 40.0, 1.3), (0.7, 50.0, 1.2)), 1.0)
+    assert probability[1] > 0.8
+    assert max(probability[0], probability[2]) < 0.2
+
+
+def test_without_a_fine_phase_nothing_is_called_a_reflection():
+    coarse = [Lamp(np.array([[1.0, 0.3, 0.03]]), light, 1.0) for light in (100.0, 20.0)]
+    assert max(reflected(coarse, 1.0)) == 0.0
+    assert len(reflected([], 1.0)) == 0
+
+
+def shaken_film(shifts, rng):
+    wall = light_of(shelves(rng, (168, 216)), 2.2)
+    label = Light(60.3, 70.6, 1.1, 0.3, lambda t, _: float(t % 1.0 < 0.5 and t % 0.2 < 0.1))
+    columns, rows = np.fft.fftfreq(216), np.fft.fftfreq(168)[:, None]
+    spectrum = np.fft.fft2(wall)
+    for k, shift in enumerate(shifts):
+        moved = np.fft.ifft2(spectrum * np.exp(-2j * np.pi * (columns * shift[0] + rows * shift[1]))).real
+        light = moved[12:-12, 12:-12].astype(np.float32)
+        add(light, label, shift, label.share(k / 30.0, 0.01))
+        grey = 255.0 * np.clip(light, 0.0, 1.0) ** (1.0 / 2.2) + rng.normal(0.0, 1.5, light.shape)
+        yield np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def test_a_shaking_camera_is_measured_and_does_not_hide_a_label():
+    rng = np.random.default_rng(3)
+    t = np.arange(120) / 30.0
+    shifts = 0.4 * np.stack([np.sin(2 * np.pi * 3.1 * t), np.cos(2 * np.pi * 4.3 * t) - 1.0], axis=1)
+    film = list(shaken_film(shifts, rng))
+    shake = Shake(3)
+    shake.refer(film[0], np.zeros(2))
+    cells = np.zeros((film[0].shape[0] // 2 + 8, film[0].shape[1] // 2 + 8), np.uint16)
+    found = []
+    for frame in film:
+        kernels.sum_cells(frame, cells, 3, 5)
+        found.append(shake.measure(cells))
+    assert np.sqrt(np.mean((np.array(found) - shifts) ** 2)) < 0.05
+    flashes = FlashDetector().detect(film, t)
+    assert len(flashes) == 1
+    assert np.hypot(flashes[0].u - 60.3 - shifts[:, 0].mean(), flashes[0].v - 70.6 - shifts[:, 1].mean()) < 0.15
+
+
+@pytest.mark.parametrize("place", [(2.2, 70.4), (189.3, 70.4), (90.4, 2.3), (90.4, 141.2)])
+def test_a_label_at_the_border_is_found(place):
+    rng = np.random.default_rng(1)
+    label = Light(*place, 1.1, 0.2, lambda t, _: float(t % 1.0 < 0.5 and t % 0.2 < 0.1))
+    wall = light_of(shelves(rng, (144, 192)), 2.2)
+    film = []
+    for k in range(100):
+        light = wall.copy()
+        add(light, label, np.zeros(2), label.share(k / 30.0, 0.01))
+        grey = 255.0 * light ** (1.0 / 2.2) + rng.normal(0.0, 1.5, light.shape)
+        film.append(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+    flashes = FlashDetector().detect(film, np.arange(100) / 30.0)
+    assert len(flashes) == 1
+    assert np.hypot(flashes[0].u - place[0], flashes[0].v - place[1]) < 0.3
+    (uu, uv, vv) = flashes[0].covariance
+    assert uu * vv > uv**2
+    assert flashes[0].sigma == pytest.approx(np.sqrt(0.5 * (uu + vv)))
+
+
+def test_a_stricter_false_alarm_rate_asks_for_more():
+    loose, strict = (FlashConfig(false_alarms_per_hour=rate).min_score((480, 640)) for rate in (10.0, 0.01))
+    assert strict - loose == pytest.approx(np.log(1000.0))
+
+
+def test_ours_finds_more_than_the_thesis_and_less_that_is_not_there():
+    options = Options(size=(320, 240), seconds=4.0, crowd=0.0)
+    ours, theirs = Score(), Score()
+    for number in (5, 10):
+        shown = scene(number, 1, options)
+        film, stamps = frames(shown)
+        film = list(film)
+        ours.add(FlashDetector().detect(film, stamps), shown.labels, shown.mirrored)
+        found = ThesisFlashDetector(ThesisFlashConfig(min_edges=4)).detect(film, stamps)
+        theirs.add(found, shown.labels, shown.mirrored)
+    assert ours.found >= 7
+    assert ours.found > theirs.found > 0
+    assert ours.precision >= theirs.precision
