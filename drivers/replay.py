@@ -114,7 +114,7 @@ class ReplayDriver(CameraDriver):
                 f"{self.config.file} has {size[0]}x{size[1]} pixels instead of {mode.size[0]}x{mode.size[1]}; "
                 "replay what this camera's calibration belongs to"
             )
-        return Frame(self.name, t, shot.image, self._number)
+        return Frame(self.name, t, shot.image, self._number, shot.encoded)
 
     async def _peek(self) -> Shot | None:
         """The next image; None at the end. Reading goes on in its thread if this is cancelled."""

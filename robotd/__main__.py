@@ -52,6 +52,7 @@ def parser() -> argparse.ArgumentParser:
     _add_sim(commands)
     _add_calibrate(commands)
     _add_line(commands)
+    _add_record(commands)
     return top
 
 
@@ -129,6 +130,35 @@ def _add_line(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     line.add_argument("--json", action="store_true", help="print the lines as one JSON object")
 
 
+def _add_record(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    record = commands.add_parser(
+        "record",
+        help="record cameras without a mission, while the daemon does not run",
+        description="Record cameras of the configuration to one MCAP file, until Ctrl-C or a limit is reached.",
+    )
+    record.add_argument(
+        "cameras", nargs="*", metavar="CAMERA", help="sections of camera drivers (default: all of the configuration)"
+    )
+    record.add_argument(
+        "-c", "--config", type=Path, default=DEFAULT_CONFIG, help=f"configuration (default: {DEFAULT_CONFIG})"
+    )
+    record.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.mcap", help="is overwritten")
+    record.add_argument("--seconds", type=_positive, metavar="S", help="longest (default: of the configuration)")
+    record.add_argument("--limit-mb", type=_positive, metavar="MB", help="largest (default: of the configuration)")
+    record.add_argument("--raw", action="store_true", help="keep grey levels instead of the camera's own JPEG")
+    record.add_argument("--json", action="store_true", help="print what was recorded as one JSON object")
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a number above 0")
+    return value
+
+
 def _width_range(text: str) -> tuple[float, float]:
     parts = text.split(",")
     try:
@@ -175,6 +205,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             from .line_tool import run as show_lines
 
             return show_lines(arguments)
+        if arguments.command == "record":
+            from .record_tool import run as record
+
+            return record(arguments)
         return run(arguments.config, mission=arguments.mission)
     except InputError as error:
         for problem in error.problems:

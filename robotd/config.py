@@ -85,12 +85,26 @@ class UploadConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordingConfig:
+    """[recording]"""
+
+    directory: Path = Path("/var/lib/robotd/recordings")
+    seconds: float = ranged(600.0, minimum=1.0, maximum=86400.0)
+    limit_mb: float = ranged(2000.0, minimum=1.0, maximum=1e6)
+    keep_free_mb: float = ranged(1000.0, minimum=0.0, maximum=1e6)
+    raw: bool = False
+    upload: bool = False
+    delete_uploaded: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole of robotd.toml; `drivers` holds the raw sections."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
     mission: MissionConfig = field(default_factory=MissionConfig)
     upload: UploadConfig = field(default_factory=UploadConfig)
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
     safety: SafetyLimits = field(default_factory=SafetyLimits)
     drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
 

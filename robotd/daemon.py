@@ -22,12 +22,13 @@ from .config import Calibration, Config, collect, load_calibration, load_config,
 from .control import ControlLoop
 from .errors import ConfigError, DriverFault, UploadError
 from .files import map_to_json
-from .hardware import Hardware, flicker_free
+from .hardware import CameraMode, Hardware, flicker_free
 from .journal import Journal
 from .mission import Health, Mission, complete_map
 from .notify import notify
 from .odometry import Odometry
 from .plugin import Base, Camera, Driver, Follower, Labels, load
+from .recorder import Recordings
 from .records import Event, Map
 from .safety import SafetyGate
 from .serial_log import LoggedHardware, SerialLog
@@ -267,6 +268,7 @@ class Daemon:
         gate = SafetyGate(config.safety, assembly.calibration.wheels.base, blind)
         self.control = ControlLoop(bus, cast(Base, assembly.base), self.odometry, gate)
         self.supervisors = [Supervisor(driver) for driver in assembly.drivers]
+        self.recordings = self._recordings()
 
     async def run(self, *, mission: bool) -> None:
         """Until cancelled, or with `mission` until that one has ended and its stops are uploaded."""
@@ -283,6 +285,7 @@ class Daemon:
                     self._log_events(journal),
                     self._keep_trail(journal),
                     self.control.run(),
+                    self.recordings.run(),
                     *(supervisor.run() for supervisor in self.supervisors),
                 ]
                 if uploader is not None:
@@ -298,6 +301,32 @@ class Daemon:
         finally:
             notify("STOPPING=1")
             await in_thread(journal.close)
+
+    def _recordings(self) -> Recordings:
+        """The service that records cameras on request."""
+        assembly, mission = self.assembly, self.assembly.config.mission
+        exposure = flicker_free(mission.identify.exposure_s, mission.mains_hz)
+        standing = CameraMode(exposure=exposure, mains_hz=mission.mains_hz)
+        cameras = dict(assembly.cameras)
+        cameras.setdefault(assembly.eye.name, assembly.eye)
+        recording = assembly.config.recording
+
+        def is_busy() -> bool:
+            status = assembly.bus.status.latest
+            return status is not None and status.state in ("driving", "settling", "observing", "paused")
+
+        return Recordings(
+            replace(recording, directory=assembly.path.parent / recording.directory),
+            assembly.config.robot.name,
+            bus=assembly.bus,
+            hardware=assembly.hardware,
+            calibration=assembly.calibration,
+            cameras={name: cast(Camera, driver) for name, driver in cameras.items()},
+            mode=lambda name: standing if name in assembly.cameras else cast(Follower, assembly.follower).mode,
+            groups=mission.camera_groups,
+            pattern=mission.identify.pattern,
+            is_busy=is_busy,
+        )
 
     def _uploader(self, journal: Journal) -> Uploader | None:
         upload = self.assembly.config.upload

@@ -32,11 +32,15 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One image, (H, W) uint8, taken at `t` seconds; `name` says which in messages."""
+    """One image, (H, W) uint8, taken at `t` seconds; `name` says which in messages.
+
+    `encoded` is the JPEG as the camera sent it, where a recording has it.
+    """
 
     t: float
     image: Image
     name: str
+    encoded: bytes | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +128,7 @@ def _open_recording(path: Path, camera: str | None) -> Footage:
 
     def play() -> Iterator[Shot]:
         for frame in read_frames(path, name):
-            yield Shot(frame.t, frame.image, f"frame {frame.sequence}")
+            yield Shot(frame.t, frame.image, f"frame {frame.sequence}", frame.encoded)
 
     return Footage(path, cameras[name], lambda: _checked(play(), path))
 

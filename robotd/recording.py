@@ -4,9 +4,14 @@ Channels and their messages:
 
     camera/<name>                a frame that a driver took; log time is when it took it, publish time is the stamp.
                                  Little-endian: t float64 (seconds of loop time, the camera's stamp), sequence uint32,
-                                 width uint16, height uint16, then height x width grey levels, row by row.
+                                 width uint16, height uint16; then, by the channel's schema, height x width grey levels
+                                 row by row (robotd.Frame/1), or the JPEG as the camera sent it, at that size or two,
+                                 four or eight times that (robotd.Jpeg/1). The channel's metadata tell how it was taken.
     serial/<port>/from_robot     bytes as they arrived at, or were sent to, a serial port; log time is loop time.
     serial/<port>/to_robot
+
+What holds for the whole recording (robot, date, pattern, calibration) is a metadata record of the name "robotd" at its
+begin. Metadata are texts, JSON where they have a structure.
 
 Times in MCAP are nanoseconds of the loop's clock. Chunks are compressed with zstd and small, so that a recording that
 ends in the middle, because the machine lost power, can be read up to the last fraction of a second that the disk had;
@@ -15,42 +20,42 @@ ends in the middle, because the machine lost power, can be read up to the last f
 
 from __future__ import annotations
 
-import asyncio
 import math
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-from mcap.records import Channel, Message
+from mcap.reader import make_reader
+from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from .bus import Bus
-from .clock import in_executor, now
+from . import jpeg
 from .errors import InputError
 from .records import Frame
 
 FRAME = struct.Struct("<dIHH")
 FRAME_SCHEMA = "robotd.Frame/1"
+JPEG_SCHEMA = "robotd.Jpeg/1"
 SERIAL_SCHEMA = "robotd.SerialBytes/1"
-FRAME_TEXT = (
-    b"little-endian: t float64 s, sequence uint32, width uint16, height uint16, then height*width uint8 grey levels"
-)
-SERIAL_TEXT = b"raw bytes of a serial line"
+_HEAD_TEXT = b"little-endian: t float64 s, sequence uint32, width uint16, height uint16, then "
+SCHEMAS = {
+    FRAME_SCHEMA: _HEAD_TEXT + b"height*width uint8 grey levels",
+    JPEG_SCHEMA: _HEAD_TEXT
+    + b"a JPEG of width x height times 1, 2, 4 or 8; the channel's metadata may say channel: red",
+    SERIAL_SCHEMA: b"raw bytes of a serial line",
+}
+ABOUT = "robotd"  # name of the metadata record
 CHUNK = 256 << 10  # bytes before compression: what a crash can cost
 TAIL = 64 << 10  # bytes kept free below the limit for the index
-INDEX = 64  # bytes that the index grows by for each message, at most
+INDEX = 256  # bytes that a message takes beside its content, at most: it may be a chunk by itself
 RECORD_LIMIT = 64 << 20  # bytes of a record: more than any of ours, so that damage cannot fill the memory
-BATCH_S = 0.5  # a power cut costs this and a chunk
-WAITING = 64  # frames of a camera that wait for the disk
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +77,8 @@ class FrameRecorder:
         Overwritten if it exists.
     limit : int, optional
         Bytes that the finished file may take.
+    about : mapping of str to str
+        What holds for the whole recording.
 
     Attributes
     ----------
@@ -79,22 +86,22 @@ class FrameRecorder:
         Messages that were taken, and those that were not because the limit was reached.
     """
 
-    def __init__(self, path: Path, limit: int | None = None) -> None:
+    def __init__(self, path: Path, limit: int | None = None, about: Mapping[str, str] | None = None) -> None:
         self.path = path
         self.limit = limit
+        self.about = dict(about or {})
         self.written = self.refused = 0
         self._pending = 0  # bytes that may not have reached the file
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
         self._writer: Any = None
 
     def __enter__(self) -> FrameRecorder:
         self._file = self.path.open("wb")
         self._writer = Writer(self._file, chunk_size=CHUNK, compression=CompressionType.ZSTD)
         self._writer.start(profile="robotd", library="robotd")
-        self._schemas = {
-            name: self._writer.register_schema(name, "text/plain", text)
-            for name, text in ((FRAME_SCHEMA, FRAME_TEXT), (SERIAL_SCHEMA, SERIAL_TEXT))
-        }
+        self._schemas = {name: self._writer.register_schema(name, "text/plain", text) for name, text in SCHEMAS.items()}
+        if self.about:
+            self._writer.add_metadata(ABOUT, self.about)
         return self
 
     def __exit__(
@@ -110,43 +117,80 @@ class FrameRecorder:
         """Whether the limit was reached."""
         return self.refused > 0
 
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far."""
+        return int(self._file.tell()) if not self._file.closed else self.path.stat().st_size
+
     def sync(self) -> None:
         """Have the disk keep what was written so far; blocks."""
+        self._writer.flush()  # ends the chunk
+        self._pending = 0
         self._file.flush()
         os.fsync(self._file.fileno())
 
-    def frame(self, frame: Frame, delivered: float) -> None:
-        """Record a frame that was taken at loop time `delivered`."""
+    def frame(self, frame: Frame, delivered: float, about: Mapping[str, str] | None = None) -> None:
+        """Record a frame that was taken at loop time `delivered`: its JPEG if it has one, else its grey levels.
+
+        `about` says how it was taken. Of a frame with a JPEG, "channel" names the one that detectors get.
+        """
         height, width = frame.image.shape
         head = FRAME.pack(frame.t, frame.sequence, width, height)
-        self._write(
-            f"camera/{frame.camera}", FRAME_SCHEMA, delivered, frame.t, head + frame.image.tobytes(), frame.sequence
-        )
+        if frame.encoded is not None:
+            schema, body = JPEG_SCHEMA, frame.encoded
+        else:
+            schema, body = FRAME_SCHEMA, frame.image.tobytes()
+        self._write(f"camera/{frame.camera}", schema, about, delivered, frame.t, head + body, frame.sequence)
 
     def serial(self, port: str, t: float, data: bytes, *, to_robot: bool) -> None:
         """Record bytes on a serial line."""
         topic = f"serial/{port}/{'to' if to_robot else 'from'}_robot"
-        self._write(topic, SERIAL_SCHEMA, t, t, data, 0)
+        self._write(topic, SERIAL_SCHEMA, None, t, t, data, 0)
 
-    def copy(self, topic: str, message: Message) -> None:
+    def copy(self, source: Source, message: Message) -> None:
         """Record a message of another recording."""
-        schema = FRAME_SCHEMA if topic.startswith("camera/") else SERIAL_SCHEMA
         log, publish = message.log_time / 1e9, message.publish_time / 1e9
-        self._write(topic, schema, log, publish, message.data, message.sequence)
+        self._write(source.topic, source.schema, source.about, log, publish, message.data, message.sequence)
 
-    def _write(self, topic: str, schema: str, log: float, publish: float, data: bytes, sequence: int) -> None:
+    def _write(
+        self,
+        topic: str,
+        schema: str,
+        about: Mapping[str, str] | None,
+        log: float,
+        publish: float,
+        data: bytes,
+        sequence: int,
+    ) -> None:
+        key = topic, schema, tuple(sorted((about or {}).items()))
         if self.limit is not None:
-            self._pending += len(data) + INDEX
+            extra = 2 * sum(len(text) + 8 for item in key[2] for text in item) if key not in self._channels else 0
+            self._pending += len(data) + INDEX + extra
             if self._pending > CHUNK:
-                self._pending = len(data) + INDEX
+                self._pending = len(data) + INDEX + extra
             index = TAIL + INDEX * self.written
             if self.refused or self._file.tell() + self._pending + index > self.limit:
                 self.refused += 1
                 return
         self.written += 1
-        if topic not in self._channels:
-            self._channels[topic] = self._writer.register_channel(topic, "robotd", self._schemas[schema])
-        self._writer.add_message(self._channels[topic], _nanoseconds(log), data, _nanoseconds(publish), sequence)
+        if key not in self._channels:
+            self._channels[key] = self._writer.register_channel(topic, "robotd", self._schemas[schema], dict(key[2]))
+        self._writer.add_message(self._channels[key], _nanoseconds(log), data, _nanoseconds(publish), sequence)
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a message is from: topic, schema and metadata of its channel."""
+
+    topic: str
+    schema: str
+    about: dict[str, str]
+
+    @property
+    def camera(self) -> str | None:
+        """Whose frames these are; None if they are none."""
+        kind, _, name = self.topic.partition("/")
+        return name if kind == "camera" else None
 
 
 def read_frames(path: Path, camera: str | None = None) -> Iterator[Frame]:
@@ -158,24 +202,41 @@ def read_frames(path: Path, camera: str | None = None) -> Iterator[Frame]:
         No such file, not a recording, or no such camera in it; the message names those that are there.
     """
     cameras: set[str] = set()
-    for topic, message in _Messages(path):
-        kind, _, name = topic.partition("/")
-        if kind != "camera":
+    for source, message in _Messages(path):
+        name = source.camera
+        if name is None:
             continue
         cameras.add(name)
         if camera is None or name == camera:
-            t, sequence, width, height = FRAME.unpack_from(message.data)
-            image = np.frombuffer(message.data, np.uint8, offset=FRAME.size).reshape(height, width)
-            yield Frame(name, t, image, sequence)
+            frame = _frame(name, source, message.data)
+            if frame is None:
+                raise InputError(f"{path}: frame {message.sequence} of camera '{name}' is damaged or of another format")
+            yield frame
     if camera is not None and camera not in cameras:
         raise InputError(f"{path}: no frames of camera '{camera}'; it has {', '.join(sorted(cameras)) or 'none'}")
+
+
+def _frame(camera: str, source: Source, data: bytes) -> Frame | None:
+    """The frame in a message; None if it cannot be read."""
+    if len(data) < FRAME.size:
+        return None
+    t, sequence, width, height = FRAME.unpack_from(data)
+    if source.schema == JPEG_SCHEMA:
+        encoded = bytes(data[FRAME.size :])
+        channel: jpeg.Channel = "red" if source.about.get("channel") == "red" else "gray"
+        image = jpeg.decode(encoded, (width, height), channel)
+        return None if image is None else Frame(camera, t, image, sequence, encoded)
+    if source.schema != FRAME_SCHEMA or len(data) != FRAME.size + width * height:
+        return None
+    return Frame(camera, t, np.frombuffer(data, np.uint8, offset=FRAME.size).reshape(height, width), sequence)
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
     """What a recording holds: how many frames of each camera and pieces of each serial port, and from when to when.
 
-    `is_whole` says whether it was finished; if not, these are what can be read of it.
+    `is_whole` says whether it was finished; if not, these are what can be read of it. `about` holds for all of it;
+    `cameras` tells for each camera how its frames were taken, once for each mode in which it was.
     """
 
     frames: dict[str, int]
@@ -183,24 +244,70 @@ class Contents:
     begin: float
     end: float
     is_whole: bool
+    about: dict[str, str] = field(default_factory=dict)
+    cameras: dict[str, tuple[dict[str, str], ...]] = field(default_factory=dict)
 
 
 def read_contents(path: Path) -> Contents:
     """Look through a recording, whole or cut off; raises InputError if it is none."""
-    frames: Counter[str] = Counter()
-    serial: Counter[str] = Counter()
+    return _summary(path) or _scan(path)
+
+
+def _summary(path: Path) -> Contents | None:
+    """What the index at the end of a whole recording says; None if there is none."""
+    try:
+        with path.open("rb") as file:
+            reader = make_reader(file)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None:
+                return None
+            about = {
+                key: text
+                for item in reader.iter_metadata()
+                if item.name == ABOUT
+                for key, text in item.metadata.items()
+            }
+    except Exception:  # the file system and the reader's many; looking through the file tells which
+        return None
+    statistics, tally = summary.statistics, _Tally()
+    for number, channel in summary.channels.items():
+        source = Source(channel.topic, summary.schemas[channel.schema_id].name, dict(channel.metadata))
+        tally.add(source, statistics.channel_message_counts.get(number, 0))
+    return tally.contents(statistics.message_start_time / 1e9, statistics.message_end_time / 1e9, True, about)
+
+
+def _scan(path: Path) -> Contents:
     begin, end = math.inf, -math.inf
-    messages = _Messages(path)
-    for topic, message in messages:
-        kind, _, rest = topic.partition("/")
-        if kind == "camera":
-            frames[rest] += 1
-        elif kind == "serial":
-            serial[rest.rpartition("/")[0]] += 1
+    messages, tally = _Messages(path), _Tally()
+    for source, message in messages:
+        tally.add(source, 1)
         begin, end = min(begin, message.log_time / 1e9), max(end, message.log_time / 1e9)
     if begin > end:
         begin = end = 0.0
-    return Contents(dict(frames), dict(serial), begin, end, messages.is_whole)
+    return tally.contents(begin, end, messages.is_whole, messages.about)
+
+
+class _Tally:
+    """Counts messages by where they are from."""
+
+    def __init__(self) -> None:
+        self._frames: Counter[str] = Counter()
+        self._serial: Counter[str] = Counter()
+        self._cameras: dict[str, list[dict[str, str]]] = {}
+
+    def add(self, source: Source, count: int) -> None:
+        kind, _, rest = source.topic.partition("/")
+        if kind == "camera":
+            self._frames[rest] += count
+            ways = self._cameras.setdefault(rest, [])
+            if source.about not in ways:
+                ways.append(source.about)
+        elif kind == "serial":
+            self._serial[rest.rpartition("/")[0]] += count
+
+    def contents(self, begin: float, end: float, is_whole: bool, about: dict[str, str]) -> Contents:
+        cameras = {name: tuple(ways) for name, ways in self._cameras.items()}
+        return Contents(dict(self._frames), dict(self._serial), begin, end, is_whole, about, cameras)
 
 
 def recover(path: Path, out: Path) -> Contents:
@@ -223,11 +330,13 @@ def recover(path: Path, out: Path) -> Contents:
     InputError
         `path` is no recording, or `out` cannot be written.
     """
-    part = out.with_name(out.name + ".part")
+    part = out.with_name(out.name + ".new")  # not ".part": that is what a recorder has left behind
     try:
-        with FrameRecorder(part) as recorder:
-            for topic, message in _Messages(path):
-                recorder.copy(topic, message)
+        messages = _Messages(path)
+        first = next(iter(messages), None)  # after it the metadata are known
+        with FrameRecorder(part, about=messages.about) as recorder:
+            for source, message in messages if first is not None else ():
+                recorder.copy(source, message)
             recorder.sync()
         with part.open("rb+") as file:
             os.fsync(file.fileno())
@@ -239,77 +348,26 @@ def recover(path: Path, out: Path) -> Contents:
     return read_contents(out)
 
 
-async def record(
-    bus: Bus, cameras: Sequence[str], path: Path, *, limit: int, seconds: float = math.inf
-) -> FrameRecorder:
-    """Record what cameras publish until `seconds` have passed, the limit is reached, or it is cancelled.
-
-    Writing is done in a thread, and the disk is made to keep it every second, so that a power cut costs no more. If the
-    disk is too slow the oldest waiting frames are dropped.
-
-    Parameters
-    ----------
-    cameras : sequence of str
-        Instances of camera drivers; somebody else starts them.
-    path : Path
-        Overwritten if it exists.
-    limit : int
-        Bytes that the file may take.
-
-    Returns
-    -------
-    FrameRecorder
-        Closed; `written` and `is_full` say what came of it.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written; what was written before can be read.
-    """
-    recorder = FrameRecorder(path, limit)
-    ending = now() + seconds
-    with ExitStack() as stack:
-        queues = [stack.enter_context(bus.frames(name).subscribe(size=WAITING)) for name in cameras]
-        disk = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="recording"))  # one: nothing overtakes
-        try:
-            await in_executor(disk, recorder.__enter__)
-            try:
-                while now() < ending and not recorder.is_full:
-                    await asyncio.sleep(min(BATCH_S, ending - now()))
-                    batch = [queue.take() for queue in queues for _ in range(queue.waiting)]
-                    batch.sort(key=lambda frame: frame.t)
-                    await in_executor(disk, _write_batch, recorder, batch, now())
-            finally:
-                await in_executor(disk, recorder.__exit__, None, None, None)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    return recorder
-
-
-def _write_batch(recorder: FrameRecorder, batch: Sequence[Frame], t: float) -> None:
-    for frame in batch:
-        recorder.frame(frame, max(t, frame.t))
-    recorder.sync()
-
-
 def read_serial(path: Path, port: str | None = None) -> Iterator[SerialBytes]:
     """The bytes of one serial port, or of all, both directions in the order of time; raises InputError."""
-    for topic, message in _Messages(path):
-        kind, _, rest = topic.partition("/")
+    for source, message in _Messages(path):
+        kind, _, rest = source.topic.partition("/")
         name, _, direction = rest.rpartition("/")
         if kind == "serial" and (port is None or name == port):
             yield SerialBytes(name, message.log_time / 1e9, direction == "to_robot", bytes(message.data))
 
 
 class _Messages:
-    """Topic and message of every record, up to the end of the file or to where it was cut off."""
+    """Origin and message of every record, up to the end of the file or to where it was cut off."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self.about: dict[str, str] = {}  # known when the first message comes
         self.is_whole = False  # known at the end
 
-    def __iter__(self) -> Iterator[tuple[str, Message]]:
-        topics: dict[int, str] = {}
+    def __iter__(self) -> Iterator[tuple[Source, Message]]:
+        schemas: dict[int, str] = {}
+        sources: dict[int, Source] = {}
         try:
             file = self._path.open("rb")
         except OSError as error:
@@ -328,12 +386,16 @@ class _Messages:
                     self.is_whole = True
                     return
                 is_begun = True
-                if isinstance(record, Channel):
-                    topics[record.id] = record.topic
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    sources[record.id] = Source(record.topic, schemas.get(record.schema_id, ""), dict(record.metadata))
+                elif isinstance(record, Metadata) and record.name == ABOUT:
+                    self.about = dict(record.metadata)
                 elif isinstance(record, Message):
-                    if record.channel_id not in topics:
+                    if record.channel_id not in sources:
                         return  # damaged
-                    yield topics[record.channel_id], record
+                    yield sources[record.channel_id], record
 
 
 def _nanoseconds(t: float) -> int:

@@ -56,7 +56,7 @@ def test_the_example_explains_every_key_and_its_comments_show_the_defaults():
                 ):
                     problems.append(f"{where}.{item.name}: shows {getattr(bound, item.name)}, the default is {default}")
 
-    for section in ("robot", "upload", "safety", "mission"):
+    for section in ("robot", "upload", "recording", "safety", "mission"):
         cls = type(getattr(config, section))
         compare(section, cls, given.get(section, {}), full[section], ("identify",))
     compare("identify", type(config.mission.identify), {}, full["mission"]["identify"])

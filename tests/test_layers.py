@@ -38,9 +38,9 @@ LAYERS = {
     ],
     3: ["plugin", "camera_driver"],
     4: ["drivers"],
-    5: ["mission", "control", "wheel_runs", "daemon"],
+    5: ["mission", "control", "wheel_runs", "recorder", "daemon"],
     6: ["sim", "server"],
-    7: ["__main__", "demo", "line_tool", "floor_tool", "calibrate", "doctor", "solver_main"],
+    7: ["__main__", "demo", "line_tool", "floor_tool", "record_tool", "calibrate", "doctor", "solver_main"],
 }
 APART = {"cli": {"errors"}, "client": {"errors"}, "gateway": {"errors"}}
 APART |= {"guardian": {"errors", "serial_port"}, "serial_port": {"errors"}}  # and pyserial: the guardian's process

@@ -11,7 +11,8 @@ import pytest
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual, ticks
 from robotd.errors import InputError
-from robotd.recording import FrameRecorder, read_contents, read_frames, read_serial, record, recover
+from robotd.recorder import Progress, record
+from robotd.recording import FrameRecorder, read_contents, read_frames, read_serial, recover
 from robotd.records import Frame, assert_record_equal
 
 
@@ -101,7 +102,7 @@ def test_every_cut_can_be_read_up_to_it_and_recovered(tmp_path: Path) -> None:
         contents = recover(tmp_path / "cut.mcap", tmp_path / "whole.mcap")
         assert contents.is_whole
         assert contents.frames.get("front", 0) == len(got)
-        assert not (tmp_path / "whole.mcap.part").exists()
+        assert not (tmp_path / "whole.mcap.new").exists()
         for frame, again in zip(read_frames(tmp_path / "cut.mcap"), read_frames(tmp_path / "whole.mcap"), strict=True):
             assert_record_equal(frame, again)
 
@@ -164,7 +165,7 @@ def test_a_disk_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 
 def test_cameras_are_recorded_until_the_time_is_over(tmp_path: Path) -> None:
-    async def main() -> FrameRecorder:
+    async def main() -> Progress:
         bus = Bus()
 
         async def film() -> None:
@@ -178,11 +179,12 @@ def test_cameras_are_recorded_until_the_time_is_over(tmp_path: Path) -> None:
         finally:
             filming.cancel()
 
-    recorder = run_virtual(main())
+    progress = run_virtual(main())
     contents = read_contents(tmp_path / "x.mcap")
     assert contents.is_whole
     assert set(contents.frames) == {"front", "left"}
-    assert sum(contents.frames.values()) == recorder.written
+    assert contents.frames == progress.frames
+    assert progress.ended == "its time is over"
     assert 99 <= contents.frames["front"] <= 101
     stamps = [frame.t for frame in read_frames(tmp_path / "x.mcap", "front")]
     assert np.allclose(np.diff(stamps), 0.05)
