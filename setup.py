@@ -26,6 +26,7 @@ KERNELS = {
     "sensor": "robotd.sim._sensor",
     "bundle": "robotd.solver._bundle",
     "rays": "robotd.solver._rays",
+    "json_keys": "robotd._json_keys",
 }
 
 
@@ -62,7 +63,7 @@ def kernels() -> list[Extension]:
 setup(
     packages=PACKAGES,
     package_dir={"robotd.drivers": "drivers"},
-    package_data={"robotd": ["py.typed", "*/*.pyi", "*/*.html"]},
+    package_data={"robotd": ["py.typed", "*.pyi", "*/*.pyi", "*/*.html"]},
     data_files=[
         ("share/robotd/etc", ["etc/robotd.toml", "etc/60-robotd.rules"]),
         ("share/robotd/etc/stores", sorted(str(path) for path in Path("etc/stores").glob("*.toml"))),

@@ -26,6 +26,7 @@ from .bind import bind
 from .errors import ConfigError, InputError
 from .records import Map, Stop, Survey, Vector3
 from .survey_checks import Problems, check_header, check_map, check_stop, check_stops
+from .typed_json import decode, repeated_keys
 
 R = TypeVar("R")
 Points = dict[str, tuple[Vector3, float | None]]
@@ -59,6 +60,9 @@ def save_map(result: Map, path: str | Path) -> None:
 
 def survey_from_json(data: bytes, where: str) -> Survey:
     """Read a survey from bytes; `where` (a file or an address) starts every message of the InputError."""
+    survey = decode(Survey, data)
+    if survey is not None:
+        return _checked(survey, where, _check_survey_parts)
     table = _table(data, where, SURVEY_FORMATS)
     _tidy_survey(table)
     return _bound(Survey, table, where, _check_survey_parts)
@@ -76,19 +80,25 @@ def header_from_json(data: bytes, where: str) -> Survey:
 
 def stop_from_json(data: bytes, where: str, survey: Survey | None = None) -> Stop:
     """Read one stop; with `survey` given its cameras, roof cameras and beacons must exist there."""
-    table = _table(data, where, ())
-    _tidy_stop(table)
 
     def check(parts: Mapping[str, Any], problems: Problems) -> None:
         if len(parts) == len(dataclasses.fields(Stop)):
             rig, roofs = (survey.rig, survey.roof_cameras) if survey else (None, None)
             check_stop(Stop(**parts), "", rig, roofs, problems)
 
+    stop = decode(Stop, data)
+    if stop is not None:
+        return _checked(stop, where, check)
+    table = _table(data, where, ())
+    _tidy_stop(table)
     return _bound(Stop, table, where, check)
 
 
 def map_from_json(data: bytes, where: str) -> Map:
     """Read a map from bytes; `where` starts every message of the InputError."""
+    result = decode(Map, data)
+    if result is not None:
+        return _checked(result, where, check_map)
     table = _table(data, where, MAP_FORMATS)
     _tidy_map(table)
     return _bound(Map, table, where, check_map)
@@ -111,9 +121,7 @@ def map_to_json(result: Map) -> bytes:
 
 def check_survey(survey: Survey, where: str) -> None:
     """Check what types cannot say (a survey put together from a header and stops); raises InputError listing all."""
-    problems = Problems(where)
-    _check_survey_parts({field.name: getattr(survey, field.name) for field in dataclasses.fields(survey)}, problems)
-    problems.raise_if_any()
+    _checked(survey, where, _check_survey_parts)
 
 
 def _check_survey_parts(parts: Mapping[str, Any], problems: Problems) -> None:
@@ -128,7 +136,7 @@ def _table(data: bytes, where: str, formats: tuple[str, ...]) -> dict[str, Any]:
     """Decode a JSON object, refuse repeated keys and a `format` that is not in `formats` (if any)."""
     try:
         table = msgspec.json.decode(data)
-        repeated = _repeated_keys(data)
+        repeated = repeated_keys(data)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{where}: not valid JSON{_place(data, error)}") from error
     except (RecursionError, ValueError) as error:
@@ -176,21 +184,6 @@ def _finite(text: str) -> float:
     return value if math.isfinite(value) else _refuse_number(text)
 
 
-def _repeated_keys(data: bytes) -> list[str]:
-    """Sentences about keys that one object gives twice, of which a decoder would silently keep the last."""
-    found: list[str] = []
-
-    def look(pairs: list[tuple[str, Any]]) -> None:
-        keys = [key for key, _ in pairs]
-        if len(set(keys)) == len(keys):
-            return
-        for key in sorted({key for key in keys if keys.count(key) > 1}):
-            found.append(f"key '{key}' is given more than once in the object with keys {', '.join(keys)}; keep one")
-
-    json.loads(data, object_pairs_hook=look)
-    return found
-
-
 # a missing optional key means null, and null means missing: these bring both into the form that the records have
 
 
@@ -231,18 +224,22 @@ def _dicts(value: Any) -> Iterator[dict[str, Any]]:
 
 def _bound(cls: type[R], table: dict[str, Any], where: str, check: Callable[[Mapping[str, Any], Problems], None]) -> R:
     """Bind a decoded object and check it; if it does not bind, still check those of its parts that do."""
-    problems = Problems(where)
-    record: R | None = None
     try:
         record = bind(cls, table, where)
-        names = [field.name for field in dataclasses.fields(typing.cast(Any, cls))]
-        parts = {name: getattr(record, name) for name in names}
     except ConfigError as error:
+        problems = Problems(where)
         problems.found.extend(error.problems)
-        parts = _parts(cls, table)
-    check(parts, problems)
+        check(_parts(cls, table), problems)
+        raise InputError(*problems.found) from None
+    return _checked(record, where, check)
+
+
+def _checked(record: R, where: str, check: Callable[[Mapping[str, Any], Problems], None]) -> R:
+    """The record itself, if the check finds nothing."""
+    problems = Problems(where)
+    check({field.name: getattr(record, field.name) for field in dataclasses.fields(typing.cast(Any, record))}, problems)
     problems.raise_if_any()
-    return typing.cast(R, record)
+    return record
 
 
 def _parts(cls: type, table: dict[str, Any]) -> dict[str, Any]:

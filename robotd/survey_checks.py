@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -72,9 +73,11 @@ def check_stops(
     stops: Iterable[Stop | None] | None, rig: Rig | None, roofs: Iterable[RoofCamera | None] | None, problems: Problems
 ) -> None:
     """Check the stops among themselves and each by itself; a stop that could not be read is None."""
+    stops = tuple(stops or ())
+    suspect = _suspects(stops, rig)
     last: dict[int, int] = {}
     complete = True  # until a stop could not be read: after it nobody knows which is the first of its leg
-    for index, stop in enumerate(stops or ()):
+    for index, stop in enumerate(stops):
         path = f"stops[{index}]"
         if stop is None:
             complete = False
@@ -89,13 +92,46 @@ def check_stops(
             mend = "expected the move since the stop before it, or another leg"
             problems.add(f"{path}.move", f"found null at stop {stop.stop} of leg {stop.leg}; {mend}")
         last[stop.leg] = max(stop.stop, before or 0)
-        check_stop(stop, f"{path}.", rig, roofs, problems)
+        check_stop(stop, f"{path}.", rig, roofs, problems, sightings=bool(suspect[index]))
+
+
+def _suspects(stops: tuple[Stop | None, ...], rig: Rig | None) -> NDArray[np.bool_]:
+    """(S,) stops whose sightings must be looked at one by one.
+
+    All sightings are checked at once first, because a large survey has a hundred thousand of them.
+    """
+    suspect = np.ones(len(stops), dtype=np.bool_)
+    if rig is None or any(stop is None or None in stop.sightings for stop in stops):
+        return suspect
+    everything = [s for stop in stops if stop is not None for s in stop.sightings]
+    count = len(everything)
+    numbers = {camera.name: k for k, camera in enumerate(rig.cameras)}
+    camera = np.fromiter((numbers.get(s.camera, -1) for s in everything), np.int64, count)
+    u, v = (np.fromiter(map(attrgetter(name), everything), np.float64, count) for name in ("u", "v"))
+    sigma = np.fromiter((1.0 if s.sigma_px is None else s.sigma_px for s in everything), np.float64, count)
+    probability = np.fromiter((1.0 if s.probability is None else s.probability for s in everything), np.float64, count)
+    named = np.fromiter((s.label != "" for s in everything), np.bool_, count)
+    good = (camera >= 0) & named & (sigma > 0.0) & (probability >= 0.0) & (probability <= 1.0)
+    limits = np.array([_limits(model) for model in rig.cameras]).reshape(-1, 4)
+    if len(limits):
+        low_u, high_u, low_v, high_v = limits[camera].T
+        good &= (low_u <= u) & (u <= high_u) & (low_v <= v) & (v <= high_v)
+    owner = np.repeat(np.arange(len(stops)), [len(stop.sightings) if stop is not None else 0 for stop in stops])
+    return np.bincount(owner[~good], minlength=len(stops)) > 0
 
 
 def check_stop(
-    stop: Stop, path: str, rig: Rig | None, roofs: Iterable[RoofCamera | None] | None, problems: Problems
+    stop: Stop,
+    path: str,
+    rig: Rig | None,
+    roofs: Iterable[RoofCamera | None] | None,
+    problems: Problems,
+    sightings: bool = True,
 ) -> None:
-    """Check one stop; `path` starts the paths of its values, e.g. `stops[3].`; without `rig` names are not compared."""
+    """Check one stop; `path` starts the paths of its values, e.g. `stops[3].`; without `rig` names are not compared.
+
+    `sightings` False leaves out those of labels, which are known to be right.
+    """
     for name in ("leg", "stop"):
         if not 1 <= getattr(stop, name) < 2**31:
             problems.add(f"{path}{name}", f"found {describe(getattr(stop, name))}; expected a number from 1")
@@ -103,7 +139,7 @@ def check_stop(
     if stop.move is not None:
         _covariance(stop.move.covariance, f"{path}move.covariance", problems)
     cameras = {camera.name: camera for camera in rig.cameras} if rig else None
-    for index, sighting in _bound(stop.sightings):
+    for index, sighting in _bound(stop.sightings if sightings else ()):
         where = f"{path}sightings[{index}]"
         if not sighting.label:
             problems.add(f"{where}.label", "found an empty text; expected the label's id")
@@ -113,8 +149,7 @@ def check_stop(
             problems.add(f"{where}.probability", f"found {sighting.probability:g}; expected 0 to 1")
         if cameras is not None and _exists(sighting.camera, cameras, f"{where}.camera", "camera of the rig", problems):
             camera = cameras[sighting.camera]
-            slack = 0.25 if any(camera.distortion) else 1.0  # undistorted pixels of a wide lens lie outside the image
-            _inside(sighting.u, sighting.v, camera.size, slack, where, problems)
+            _inside(sighting.u, sighting.v, camera.size, _slack(camera), where, problems)
     known = {roof.name: roof for roof in roofs if roof is not None} if roofs is not None else None
     for index, beacon in _bound(stop.beacon_sightings):
         where = f"{path}beacon_sightings[{index}]"
@@ -212,11 +247,28 @@ def _exists(name: str, known: Mapping[str, Any], path: str, what: str, problems:
     return False
 
 
+def _slack(camera: CameraModel) -> float:
+    """By what share of the image a pixel may lie outside of it: undistorted pixels of a wide lens do by far."""
+    return 0.25 if any(camera.distortion) else 1.0
+
+
+def _limits(camera: CameraModel) -> tuple[float, float, float, float]:
+    """Lowest and highest u, then v; none for a camera whose size was refused already."""
+    if not _is_size(camera.size):
+        return (-np.inf, np.inf, -np.inf, np.inf)
+    (low_u, high_u), (low_v, high_v) = (_range(length, _slack(camera)) for length in camera.size)
+    return (low_u, high_u, low_v, high_v)
+
+
+def _range(length: int, slack: float) -> tuple[float, float]:
+    return -0.5 - slack * length, length - 0.5 + slack * length
+
+
 def _inside(u: float, v: float, size: tuple[int, int], slack: float, path: str, problems: Problems) -> None:
     if not _is_size(size):
         return  # named already
     for name, value, length, extent in (("u", u, size[0], "wide"), ("v", v, size[1], "high")):
-        low, high = -0.5 - slack * length, length - 0.5 + slack * length
+        low, high = _range(length, slack)
         if not low <= value <= high:
             expected = f"{low:g} to {high:g}, as the image is {length} px {extent}"
             problems.add(f"{path}.{name}", f"found {value:g}; expected {expected}")
@@ -238,6 +290,11 @@ def _scaled(rows: Matrix3) -> tuple[NDArray[np.float64], float]:
 
 def _covariance(rows: Matrix3, path: str, problems: Problems) -> None:
     """Symmetric and positive semi-definite, within rounding."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    if b == d and c == g and f == h and a > 0.0 and a * e > b * b:
+        determinant = a * (e * i - f * f) - b * (b * i - f * c) + c * (b * f - e * c)
+        if determinant > 1e-9 * a * e * i > 0.0:
+            return  # positive definite by its leading minors (Sylvester), clearly enough for rounding not to matter
     matrix, scale = _scaled(rows)
     if np.abs(matrix - matrix.T).max() > ROUNDING:
         problems.add(path, "is not symmetric; expected a covariance")

@@ -24,6 +24,7 @@ LAYERS = {
         "path_error",
         "wheel_calibration",
         "toml_edit",
+        *("typed_json", "_json_keys"),
         *("follow", "drive_path", "lost_line"),
         "identify",
         "safety",

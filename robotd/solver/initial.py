@@ -161,16 +161,18 @@ def _meet(origin: Floats, direction: Floats, i: Ints, j: Ints) -> tuple[Floats, 
     return X, usable & (determinant > np.sin(_LEAST_PARALLAX) ** 2)
 
 
-def epipolar_moves(problem: Problem, sightings: Sightings) -> Floats:
+def epipolar_moves(problem: Problem, sightings: Sightings, guess: Floats | None = None) -> Floats:
     """Moves (M, 3) corrected by the coplanarity of rays to labels seen from both of their stops.
 
     Minimised is a Cauchy loss of the angles by which the rays miss each other, plus the same of the move's odometry
-    residual, first over a grid of headings and directions and then by damped Gauss-Newton steps, all moves at once.
+    residual, first over a grid of headings and directions around `guess` (M, 3), by default the measured moves, and
+    then by damped Gauss-Newton steps, all moves at once.
     """
     moves = problem.moves
+    guess = moves.measured if guess is None else guess
     a, b, owner = _common_rays(moves.before, moves.after, sightings)
     if len(owner) == 0:
-        return moves.measured.copy()
+        return guess.copy()
     rays = _RayPairs(sightings, a, b, owner, len(moves.before))
     root = np.linalg.inv(np.linalg.cholesky(moves.covariance))
 
@@ -179,13 +181,13 @@ def epipolar_moves(problem: Problem, sightings: Sightings) -> Floats:
         return np.asarray(rays.losses(move) + 9.0 * np.log1p(prior / 9.0))
 
     sigma = np.sqrt(np.diagonal(moves.covariance, axis1=1, axis2=2))
-    distance = np.maximum(np.hypot(moves.measured[:, 0], moves.measured[:, 1]), 0.05)
+    distance = np.maximum(np.hypot(guess[:, 0], guess[:, 1]), 0.05)
     widest = np.maximum(3.0 * sigma[:, 2], 0.15)
     sideways = np.minimum(np.maximum(3.0 * sigma[:, 1] / distance, 0.1), 1.2)
-    best, lowest = moves.measured.copy(), losses(moves.measured)
+    best, lowest = guess.copy(), losses(guess)
     for turn in np.linspace(-1.0, 1.0, 9):
         for side in np.linspace(-1.0, 1.0, 5):
-            trial = moves.measured.copy()
+            trial = guess.copy()
             trial[:, :2] = (heading_matrix(side * sideways) @ trial[:, :2, None])[:, :, 0]
             trial[:, 2] += turn * widest
             cost = losses(trial)

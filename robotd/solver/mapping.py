@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from ..geometry.transforms import wrap_angle
+from ..geometry.transforms import pose_array, wrap_angle
 from ..records import (
     Candidate,
     Floats,
@@ -18,6 +19,7 @@ from ..records import (
     MappedSighting,
     MappedStop,
     Matrix3,
+    Pose,
     SolverRun,
     Survey,
     Vector3,
@@ -36,7 +38,11 @@ _CLEARLY_NEARER_M = 0.2
 _UNKNOWN = np.diag([1e6, 1e6, np.pi**2])  # covariance of a stop that nothing ties to the world
 
 
-def solve(survey: Survey, method: Literal["bundle", "linear"] = "bundle") -> Map:
+def solve(
+    survey: Survey,
+    method: Literal["bundle", "linear"] = "bundle",
+    start: Mapping[tuple[int, int], Pose] | None = None,
+) -> Map:
     """Make the map of a survey.
 
     Parameters
@@ -44,6 +50,8 @@ def solve(survey: Survey, method: Literal["bundle", "linear"] = "bundle") -> Map
     survey : Survey
     method : {"bundle", "linear"}
         Robust bundle adjustment of everything, or the thesis's linear triangulation from odometry as a baseline.
+    start : mapping of (leg, stop) to Pose, optional
+        Where the bundle adjustment begins, instead of odometry; for all stops, in any world axes.
 
     Returns
     -------
@@ -62,7 +70,10 @@ def solve(survey: Survey, method: Literal["bundle", "linear"] = "bundle") -> Map
         return solve_linear(problem)
     if method != "bundle":
         raise ValueError(f"method must be bundle or linear, got {method!r}")
-    return _to_map(problem, optimise(problem))
+    poses = None
+    if start is not None:
+        poses = np.array([pose_array(start[stop.leg, stop.stop]) for stop in problem.survey.stops])
+    return _to_map(problem, optimise(problem, poses))
 
 
 def _to_map(asked: Problem, optimum: Optimum) -> Map:

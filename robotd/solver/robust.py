@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..geometry.transforms import se2_relative
 from ..records import Floats
 from .bundle import SQUARE, Adjustment, Loss, Solution
 from .covariance import Covariance, covariance
@@ -79,17 +80,23 @@ class Optimum:
     converged: bool
 
 
-def optimise(problem: Problem) -> Optimum:
-    """Find the poses, rig and points that explain the sightings, whatever else is among them."""
-    problem, placement, solution, iterations = _best_start(problem)
+def optimise(problem: Problem, start: Floats | None = None) -> Optimum:
+    """Find the poses, rig and points that explain the sightings, whatever else is among them.
+
+    `start` (S, 3) holds x, y, heading of every stop to begin from; by default those that odometry chains.
+    """
+    problem, placement, solution, iterations = _best_start(problem, start)
     return _finish(detach(problem, placement.placed), placement.placed, solution.state, iterations)
 
 
-def _best_start(problem: Problem) -> tuple[Problem, Placement, Solution, int]:
+def _best_start(problem: Problem, start: Floats | None) -> tuple[Problem, Placement, Solution, int]:
     best: tuple[float, Placement, Solution] | None = None
     iterations = 0
+    guess = problem.moves.measured
+    if start is not None:
+        guess = se2_relative(start[problem.moves.before], start[problem.moves.after])
     for schedule in _SCHEDULES:
-        moves = epipolar_moves(problem, problem.sightings) if schedule.epipolar else problem.moves.measured
+        moves = epipolar_moves(problem, problem.sightings, guess) if schedule.epipolar else guess
         placement = place(problem, moves, schedule.tolerance)
         if not placement.placed.any():
             # only outside references can leave every stop without a place
