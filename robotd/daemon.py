@@ -29,6 +29,7 @@ from .notify import notify
 from .odometry import Odometry
 from .plugin import Base, Camera, Driver, Follower, Labels, load
 from .recorder import Recordings
+from .recording_upload import RecordingUploader
 from .records import Event, Map
 from .safety import SafetyGate
 from .serial_log import LoggedHardware, SerialLog
@@ -290,6 +291,8 @@ class Daemon:
                 ]
                 if uploader is not None:
                     work.append(uploader.run())
+                    if config.recording.upload:
+                        work.append(self._upload_recordings(uploader).run())
                 if assembly.serial_log is not None:
                     work.append(assembly.serial_log.follow(assembly.bus))
                 tasks = [group.create_task(item) for item in work]
@@ -346,6 +349,20 @@ class Daemon:
             self.assembly.bus.events.publish(Event(now(), "upload", level, text))
 
         return Uploader(journal, upload.url, token, upload.retry_s, upload.timeout_s, report)
+
+    def _upload_recordings(self, uploader: Uploader) -> RecordingUploader:
+        """Sends finished recordings to where the stops go."""
+        recordings = RecordingUploader(
+            self.recordings.config.directory,
+            uploader.url,
+            uploader.token,
+            retry_s=uploader.retry_s,
+            timeout_s=uploader.timeout_s,
+            delete=self.recordings.config.delete_uploaded,
+            report=uploader.report,
+        )
+        self.recordings.finished = recordings.wake
+        return recordings
 
     async def _run_mission(self, journal: Journal, uploader: Uploader | None, state: Path) -> None:
         assembly, config = self.assembly, self.assembly.config

@@ -28,6 +28,7 @@ from .errors import InputError
 from .hardware import CameraMode, Hardware
 from .plugin import Camera
 from .recording import FrameRecorder, recover
+from .recording_upload import uploaded_mark
 from .records import Event, Frame
 
 BATCH_S = 0.25  # a power cut costs this and a chunk
@@ -443,11 +444,6 @@ def list_recordings(directory: Path) -> list[RecordingFile]:
     """The finished recordings in a folder, by name."""
     files = sorted(directory.glob("*.mcap")) if directory.is_dir() else []
     return [RecordingFile(path.stem, path.stat().st_size, uploaded_mark(path).exists()) for path in files]
-
-
-def uploaded_mark(path: Path) -> Path:
-    """The file whose being there says that the server has this recording."""
-    return path.with_name(path.name + ".uploaded")
 
 
 def finish_parts(directory: Path, keep_free: int = 0) -> list[str]:

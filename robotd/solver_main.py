@@ -88,6 +88,9 @@ def _parser() -> argparse.ArgumentParser:
         "--data", type=Path, metavar="DIR", default=Path("/var/lib/robotd-solver"), help="where surveys are kept"
     )
     serve.add_argument("--token-file", type=Path, metavar="FILE", help="the secret that robots must send")
+    serve.add_argument(
+        "--recording-limit-gb", type=float, default=16.0, metavar="GB", help="largest recording (default: 16)"
+    )
     serve.set_defaults(run=_serve)
     _add_calibrate(commands)
     return parser
@@ -292,7 +295,8 @@ def _serve(arguments: argparse.Namespace) -> int:
         if error.name is None or error.name.partition(".")[0] not in ("fastapi", "uvicorn", "starlette", "pydantic"):
             raise
         raise RobotdError(f"serving needs {error.name}, which is not installed; install robotd[solver]") from error
-    serve(arguments.host, arguments.port, arguments.data, token)
+    limit = round(1e9 * arguments.recording_limit_gb)
+    serve(arguments.host, arguments.port, arguments.data, token, recording_limit=limit)
     return 0
 
 

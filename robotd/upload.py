@@ -62,6 +62,7 @@ class Uploader:
             raise InputError(f"upload.url: found '{url}'; expected an address like https://solver.example:8443")
         self.journal = journal
         self.url = url.rstrip("/")
+        self.token = token
         self.retry_s = retry_s
         self.timeout_s = timeout_s
         self.report = report

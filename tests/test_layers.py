@@ -34,6 +34,7 @@ LAYERS = {
     ],
     2: [
         *("clock", "link", "real", "config", "files", "bus", "hardware", "journal", "upload", "telemetry", "recording"),
+        "recording_upload",
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
     ],

@@ -23,8 +23,9 @@ from robotd.footage import open_footage
 from robotd.hardware import CameraMode
 from robotd.plugin import Driver
 from robotd.record_tool import choose, record_cameras
-from robotd.recorder import Progress, Recordings, finish_parts, list_recordings, record, uploaded_mark
+from robotd.recorder import Progress, Recordings, finish_parts, list_recordings, record
 from robotd.recording import FrameRecorder, read_contents, read_frames, recover
+from robotd.recording_upload import uploaded_mark
 from robotd.records import CameraModel, Frame, Transform, assert_record_equal
 from robotd.vision.blink import FlashPattern
 

@@ -5,10 +5,17 @@
     GET /api/surveys                                  names and numbers of stops
     GET /api/surveys/{survey}                         robotd-survey/1
     GET /api/surveys/{survey}/map                     robotd-map/1, solved if stops came since the last one
+    GET /api/recordings                               names, sizes and hashes of the complete ones
+    GET /api/recordings/{name}                        {"received": bytes, "complete": bool}
+    PUT /api/recordings/{name}                        a piece, see below
     GET /healthz                                      no token needed
 
 Every refusal is JSON, {"problems": ["...", ...]}. A PUT may carry the SHA-256 of its body (RFC 9530); it is answered
 with the SHA-256 of what is on the disk, 201 if that is new and 200 if it was there.
+
+A piece of a recording carries `Content-Range: bytes FIRST-LAST/SIZE` (RFC 9110) and the SHA-256 of the whole as
+`Repr-Digest` (RFC 9530). It is answered as the GET is, 201 if that completed the recording; 409 with "received" says
+where to go on if the piece does not begin there.
 """
 
 from __future__ import annotations
@@ -36,6 +43,7 @@ from starlette.requests import ClientDisconnect
 
 from ..errors import InputError, RobotdError, SolverError
 from .jobs import MapJobs
+from .recordings import PIECE_LIMIT, OffsetError, Plan, RecordingStore, TooLargeError
 from .store import ConflictError, Store, StoreError, UnknownSurveyError
 
 log = logging.getLogger("robotd.server")
@@ -45,7 +53,12 @@ BODY_S = 60.0  # s, for a body to come in
 _DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
 
 
-def create_app(store: Store, token: str | None, *, jobs: MapJobs | None = None) -> FastAPI:
+_RANGE = re.compile(r"bytes (\d{1,15})-(\d{1,15})/(\d{1,15})")
+
+
+def create_app(
+    store: Store, token: str | None, *, jobs: MapJobs | None = None, recordings: RecordingStore | None = None
+) -> FastAPI:
     """The application.
 
     Parameters
@@ -56,6 +69,8 @@ def create_app(store: Store, token: str | None, *, jobs: MapJobs | None = None) 
         Secret that every request under /api must carry as `Authorization: Bearer`; None: no secret.
     jobs : MapJobs, optional
         How maps are solved: by default in a worker process.
+    recordings : RecordingStore, optional
+        Where recordings are kept; without it they are not taken.
     """
     maps = jobs or MapJobs(store)
 
@@ -94,6 +109,9 @@ def create_app(store: Store, token: str | None, *, jobs: MapJobs | None = None) 
     async def get_map(survey: str) -> Response:
         return Response(await maps.map(survey), media_type="application/json")
 
+    if recordings is not None:
+        _add_recordings(api, recordings)
+
     @app.get("/healthz")
     async def healthz() -> JSONResponse:
         return JSONResponse({"ok": True})
@@ -102,12 +120,55 @@ def create_app(store: Store, token: str | None, *, jobs: MapJobs | None = None) 
     return app
 
 
+def _add_recordings(api: APIRouter, store: RecordingStore) -> None:
+    @api.get("/recordings")
+    async def known() -> JSONResponse:
+        found = await asyncio.to_thread(store.list)
+        entries = [{"name": name, "size": plan.size, "sha256": plan.sha256} for name, plan in found.items()]
+        return JSONResponse({"recordings": entries})
+
+    @api.get("/recordings/{name}")
+    async def received(name: str, request: Request) -> JSONResponse:
+        digest, size = request.query_params.get("sha256"), request.query_params.get("size", "")
+        plan = Plan(int(size), digest) if digest is not None and size.isdecimal() else None
+        count, complete = await asyncio.to_thread(store.received, name, plan)
+        return JSONResponse({"received": count, "complete": complete})
+
+    @api.put("/recordings/{name}")
+    async def put_piece(name: str, request: Request) -> JSONResponse:
+        found = _RANGE.fullmatch(request.headers.get("content-range", ""))
+        whole = _DIGEST.search(request.headers.get("repr-digest", ""))
+        if found is None or whole is None:
+            raise InputError("expected Content-Range: bytes FIRST-LAST/SIZE and Repr-Digest: sha-256=:BASE64:")
+        first, last, size = map(int, found.groups())
+        body = await _body(request, PIECE_LIMIT)
+        if last - first + 1 != len(body):
+            raise HTTPException(400, f"the body has {len(body)} bytes, not those that Content-Range names")
+        try:
+            digest = base64.b64decode(whole[1], validate=True).hex()
+        except ValueError:
+            raise InputError("Repr-Digest: expected the SHA-256 in base64") from None
+        try:
+            count, complete = await asyncio.to_thread(store.put, name, Plan(size, digest), first, body)
+        except OffsetError as error:
+            return JSONResponse({"problems": list(error.problems), "received": error.received}, 409)
+        return JSONResponse({"received": count, "complete": complete}, 201 if complete else 200)
+
+
 def announce(url: str) -> None:
     """Tell whoever started the server where it is."""
     print(f"robotd-solver: listening on {url}", flush=True)
 
 
-def serve(host: str, port: int, data: Path, token: str | None, ready: Callable[[str], None] = announce) -> None:
+def serve(
+    host: str,
+    port: int,
+    data: Path,
+    token: str | None,
+    ready: Callable[[str], None] = announce,
+    *,
+    recording_limit: int = 16 << 30,
+) -> None:
     """Serve until SIGTERM or Ctrl-C.
 
     Parameters
@@ -120,6 +181,8 @@ def serve(host: str, port: int, data: Path, token: str | None, ready: Callable[[
         As `create_app`; without one only this computer may be listened to.
     ready : callable
         Called with the server's address once it answers.
+    recording_limit : int
+        Bytes that a recording may have.
 
     Raises
     ------
@@ -141,7 +204,7 @@ def serve(host: str, port: int, data: Path, token: str | None, ready: Callable[[
         name = f"[{host}]" if family == socket.AF_INET6 else host
         url = f"http://{name}:{listener.getsockname()[1]}"
         config = uvicorn.Config(
-            create_app(Store(data), token),
+            create_app(Store(data), token, recordings=RecordingStore(data, recording_limit)),
             log_level="warning",
             access_log=False,
             limit_concurrency=256,
@@ -179,22 +242,22 @@ def _guard(token: str | None) -> Callable[[Request], Any]:
     return guard
 
 
-async def _body(request: Request) -> bytes:
-    """The request's body, checked against its hash if it names one; never more than BODY_LIMIT in memory."""
+async def _body(request: Request, limit: int = BODY_LIMIT) -> bytes:
+    """The request's body, checked against its hash if it names one; never more than `limit` bytes in memory."""
     chunks: list[bytes] = []
     size = 0
     try:
         async with asyncio.timeout(BODY_S):
             async for chunk in request.stream():
                 size += len(chunk)
-                if size <= BODY_LIMIT:
+                if size <= limit:
                     chunks.append(chunk)
-                elif size > 8 * BODY_LIMIT:  # until then read on, so that the sender comes to read the answer
+                elif size > 8 * limit:  # until then read on, so that the sender comes to read the answer
                     break
     except TimeoutError:
         raise HTTPException(408, f"the body did not come within {BODY_S:g} s") from None
-    if size > BODY_LIMIT:
-        raise HTTPException(413, f"the body has more than {BODY_LIMIT} bytes; is that one record?")
+    if size > limit:
+        raise HTTPException(413, f"the body has more than {limit} bytes; is that one record?")
     body = b"".join(chunks)
     named = _DIGEST.search(request.headers.get("content-digest", ""))
     if named and named[1] != base64.b64encode(hashlib.sha256(body).digest()).decode():
@@ -235,6 +298,7 @@ def _add_refusals(app: FastAPI) -> None:
     statuses: dict[type[RobotdError], int] = {
         UnknownSurveyError: 404,
         ConflictError: 409,
+        TooLargeError: 413,
         InputError: 422,
         SolverError: 422,
         StoreError: 507,

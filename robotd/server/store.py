@@ -156,7 +156,7 @@ class Store:
             if not path.parent.is_dir():
                 path.parent.mkdir(parents=True)
                 for folder in (path.parent.parent, path.parent.parent.parent):
-                    _sync(folder)
+                    sync_folder(folder)
             write_atomic(path, body)
         except OSError as error:
             raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error
@@ -182,7 +182,8 @@ def _read(path: Path) -> bytes | None:
         raise StoreError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _sync(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Have the disk keep the names in a folder."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,0 +1,222 @@
+"""Bring finished recordings to the server, piece by piece, going on where a cut connection ended.
+
+The server acknowledges a piece when its disk has it, and the whole when its hash is right; only then is the recording
+marked as uploaded (a file beside it), and deleted if that is wanted. Sending again what the server has costs
+one question. No more than one piece is ever in memory.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
+
+import aiohttp
+import yarl
+
+from .clock import in_thread, outside
+from .errors import UploadError
+from .files import write_atomic
+
+PIECE = 1 << 20  # bytes
+LONGEST = 64  # times retry_s: the longest pause
+PASSING = (400, 401, 403, 408, 429)  # damaged on the way, a token to be mended, "later"
+
+Report = Callable[[str, Literal["info", "warning", "error"]], None]
+
+
+class RecordingUploader:
+    """Sends the finished recordings of a folder, oldest name first.
+
+    Parameters
+    ----------
+    directory : Path
+        Where "*.mcap" lie.
+    url : str
+        Of the server.
+    token : str or None
+        Secret shared with the server.
+    retry_s, timeout_s : float
+        First pause after a failure, which doubles up to 64 times that; longest wait for an answer.
+    delete : bool
+        Delete what the server has.
+    report : callable
+        Gets a sentence and its level, once per change of state.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        url: str,
+        token: str | None,
+        *,
+        retry_s: float,
+        timeout_s: float,
+        delete: bool,
+        report: Report,
+    ) -> None:
+        self.directory = directory
+        self.url = url.rstrip("/")
+        self.retry_s = retry_s
+        self.timeout_s = timeout_s
+        self.delete = delete
+        self.report = report
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._wake = asyncio.Event()
+        self._wake.set()
+        self._empty = asyncio.Event()
+        self._refused: set[str] = set()
+        self._trouble: str | None = None
+
+    def wake(self) -> None:
+        """Say that there is a new recording."""
+        self._empty.clear()
+        self._wake.set()
+
+    async def wait_empty(self) -> None:
+        """Wait until the server has, or has refused, every recording there was at the last `wake`."""
+        await self._empty.wait()
+
+    async def run(self) -> None:
+        """Send until cancelled."""
+        pause = self.retry_s
+        connector = aiohttp.TCPConnector(force_close=True)
+        async with aiohttp.ClientSession(headers=self._headers, connector=connector) as session:
+            while True:
+                await self._wake.wait()
+                self._wake.clear()
+                try:
+                    for path in await in_thread(self._waiting):
+                        await self._offer(session, path)
+                except UploadError as error:
+                    if str(error) != self._trouble:
+                        self.report(f"{error}; recordings are kept and sent again", "warning")
+                    self._trouble = str(error)
+                    self._wake.set()
+                    await asyncio.sleep(pause)
+                    pause = min(2.0 * pause, LONGEST * self.retry_s)
+                else:
+                    pause, self._trouble = self.retry_s, None
+                    if not self._wake.is_set():
+                        self._empty.set()
+
+    def _waiting(self) -> list[Path]:
+        files = sorted(self.directory.glob("*.mcap")) if self.directory.is_dir() else []
+        return [path for path in files if path.stem not in self._refused and not uploaded_mark(path).exists()]
+
+    async def _offer(self, session: aiohttp.ClientSession, path: Path) -> None:
+        try:
+            await self._send(session, path)
+        except UploadError as error:
+            if not error.permanent:
+                raise
+            self._refused.add(path.stem)  # until the next start
+            self.report(f"{path.name} is refused and stays on the robot: {error}", "error")
+
+    async def _send(self, session: aiohttp.ClientSession, path: Path) -> None:
+        """Bring one recording to the server; raises UploadError."""
+        try:
+            size, digest = await in_thread(_measure, path)
+        except OSError as error:
+            raise UploadError(f"{path}: cannot be read: {error.strerror or error}", permanent=True) from error
+        address = f"{self.url}/api/recordings/{quote(path.stem, safe='')}"
+        question = f"{address}?size={size}&sha256={digest.hex()}"
+        at, complete = self._understood(await self._exchange(session, "GET", question))
+        while not complete:
+            before = at
+            body = await in_thread(_read, path, at)
+            if not body and size:
+                raise UploadError(f"{path}: has become shorter while it was sent", permanent=True)
+            headers = {
+                "Content-Type": "application/octet-stream",
+                "Content-Range": f"bytes {at}-{at + len(body) - 1}/{size}",
+                "Content-Digest": _spelled(hashlib.sha256(body).digest()),
+                "Repr-Digest": _spelled(digest),
+            }
+            at, complete = self._understood(await self._exchange(session, "PUT", address, body, headers))
+            if at <= before and not complete:
+                raise UploadError(f"{self.url} has lost a part of {path.name}, it gets that again")
+            if self._trouble is not None:
+                self._trouble = None
+                self.report(f"{self.url} takes recordings again", "info")
+        await in_thread(_settle, path, self.url, digest, delete=self.delete)
+        self.report(f"{path.name} is on the server ({size / 1e6:.1f} MB)", "info")
+
+    async def _exchange(
+        self,
+        session: aiohttp.ClientSession,
+        method: str,
+        address: str,
+        body: bytes | None = None,
+        headers: dict[str, str] | None = None,
+    ) -> tuple[int, Any]:
+        """One request; returns status and JSON of the answer."""
+        try:
+            with outside():
+                async with session.request(
+                    method,
+                    yarl.URL(address, encoded=True),
+                    data=body,
+                    headers=headers,
+                    timeout=aiohttp.ClientTimeout(total=self.timeout_s),
+                    allow_redirects=False,
+                ) as response:
+                    status, answer = response.status, await response.read()
+        except TimeoutError as error:
+            raise UploadError(f"{self.url} did not answer within {self.timeout_s:g} s") from error
+        except (aiohttp.ClientError, OSError) as error:
+            raise UploadError(f"{self.url} cannot be reached: {error or type(error).__name__}") from error
+        try:
+            return status, json.loads(answer)
+        except ValueError:
+            return status, None
+
+    def _understood(self, answer: tuple[int, Any]) -> tuple[int, bool]:
+        """Bytes that the server has, and whether it has the whole; raises UploadError."""
+        status, said = answer
+        received = said.get("received") if isinstance(said, dict) else None
+        if isinstance(received, int) and status in (200, 201, 409):
+            return received, said.get("complete") is True
+        problems = said.get("problems") if isinstance(said, dict) else None
+        why = "; ".join(map(str, problems)) if isinstance(problems, list) else "not as a robotd-solver does"
+        raise UploadError(
+            f"{self.url} answers {status}: {why}",
+            permanent=problems is not None and 400 <= status < 500 and status not in PASSING,
+        )
+
+
+def _measure(path: Path) -> tuple[int, bytes]:
+    """Size and SHA-256 of a file."""
+    size, digest = 0, hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(PIECE):
+            size += len(block)
+            digest.update(block)
+    return size, digest.digest()
+
+
+def _read(path: Path, start: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(start)
+        return file.read(PIECE)
+
+
+def uploaded_mark(path: Path) -> Path:
+    """The file whose being there says that the server has this recording."""
+    return path.with_name(path.name + ".uploaded")
+
+
+def _settle(path: Path, url: str, digest: bytes, *, delete: bool) -> None:
+    if delete:
+        path.unlink(missing_ok=True)
+    else:
+        write_atomic(uploaded_mark(path), json.dumps({"url": url, "sha256": digest.hex()}).encode())
+
+
+def _spelled(digest: bytes) -> str:
+    return f"sha-256=:{base64.b64encode(digest).decode()}:"
