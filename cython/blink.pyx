@@ -220,6 +220,33 @@ def cut_patches(
                 memcpy(&patches[c, i, 0], &image[rows[c] + i, columns[c]], width)
 
 
+def project_runs(
+    const float[:, ::1] values,
+    const float[:, ::1] weights,
+    const float[:, ::1] waves,
+    const Py_ssize_t[::1] first,
+    const Py_ssize_t[::1] last,
+    float[:, ::1] projection,
+    float[:, ::1] sums,
+    float[:, ::1] squares,
+):
+    cdef Py_ssize_t n = values.shape[0], frames = values.shape[1], c, f, k
+    cdef float value, weight
+    with nogil:
+        projection[:, :] = 0
+        sums[:, :] = 0
+        squares[:, :] = 0
+        for c in range(n):
+            for f in range(frames):
+                weight = weights[c, f]
+                if weight > 0:
+                    value = values[c, f]
+                    for k in range(first[f], last[f]):
+                        projection[c, k] += value * waves[f, k]
+                        sums[c, k] += weight * waves[f, k]
+                        squares[c, k] += weight * waves[f, k] * waves[f, k]
+
+
 def best_runs(
     const float[:, ::1] projection,
     const float[:, ::1] sums,

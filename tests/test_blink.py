@@ -137,6 +137,11 @@ def test_light_curves_patches_and_runs_equal_their_numpy_references(seed):
     sums, squares = (3 + rng.random((2, 4, 90))).astype(np.float32)
     frames = rng.integers(60, 97, 4).astype(np.float32)
     image = rng.integers(0, 256, (30, 40), dtype=np.uint8)
+    waves = rng.random((90, 20)).astype(np.float32) * (np.abs(np.arange(20) - np.arange(90)[:, None] / 5.0) < 3.0)
+    first = np.argmax(waves > 0.0, axis=1)
+    last = 20 - np.argmax(waves[:, ::-1] > 0.0, axis=1)
+    weights = (rng.random((4, 90)) < 0.8).astype(np.float32)
+    curves = weights * rng.normal(size=(4, 90)).astype(np.float32)
     results = []
     for module in (kernels, reference):
         values, levels = np.empty((2, 4, 5), np.float32)
@@ -146,7 +151,9 @@ def test_light_curves_patches_and_runs_equal_their_numpy_references(seed):
         gain, light = np.empty((2, 4), np.float32)
         start, periods = np.empty((2, 4), np.intp)
         module.best_runs(projection, sums, squares, 25, frames, 0.01, gain, start, periods, light)
-        results.append((values, levels, patches, gain, start, periods, light))
+        runs = np.empty((3, 4, 20), np.float32)
+        module.project_runs(curves, weights, waves, first, last, *runs)
+        results.append((values, levels, patches, gain, start, periods, light, runs))
     for left, right in zip(*results, strict=True):
         np.testing.assert_allclose(left, right, rtol=2e-5, atol=2e-3)
 

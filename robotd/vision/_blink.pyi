@@ -35,6 +35,16 @@ def aperture_series(
 def cut_patches(
     image: NDArray[np.uint8], rows: NDArray[np.intp], columns: NDArray[np.intp], patches: NDArray[np.uint8]
 ) -> None: ...
+def project_runs(
+    values: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    waves: NDArray[np.float32],
+    first: NDArray[np.intp],
+    last: NDArray[np.intp],
+    projection: NDArray[np.float32],
+    sums: NDArray[np.float32],
+    squares: NDArray[np.float32],
+) -> None: ...
 def best_runs(
     projection: NDArray[np.float32],
     sums: NDArray[np.float32],

@@ -45,6 +45,7 @@ Singles = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 _RING = 96  # frames kept; at 328x248 cells of 2 bytes 15.6 MB
+_FEW = 4  # frames since the last decision that are not worth another one
 _BLOCK = 32  # frames whose alternation fits into 16 bits: 32 * 63 * 63 / 4 < 2^15
 _BLOCK_LIMIT = 1500
 _TILE = (24, 32)  # cells over which the false alarm rate is held constant
@@ -133,7 +134,7 @@ class FlashDetector:
         self._blocks: deque[tuple[int, NDArray[np.int16]]] = deque()
         self._count = 0
         self._block_frames = 0
-        self._decided = -np.inf
+        self._due = -np.inf
 
     def update(self, frame: NDArray[np.uint8], t: float) -> bool:
         """Take one frame.
@@ -164,9 +165,10 @@ class FlashDetector:
                 return False
         frame = np.ascontiguousarray(frame)
         self._accumulate(frame, t)
-        if t - self._decided < self.config.decision_s and self._block_frames < _BLOCK:
+        if t < self._due and self._block_frames < _BLOCK:
             return False
         self._decide(t)
+        self._due = t + self.config.decision_s - 0.5 * self._pace()  # because a frame late every time adds up
         self._keep_reference(frame)
         return True
 
@@ -175,12 +177,12 @@ class FlashDetector:
         self.reset()
         for frame, t in zip(frames, times, strict=True):
             self.update(frame, float(t))
-        if self._block_frames:
-            self._decide(float(times[-1]))
         return self.flashes()
 
     def flashes(self) -> list[Flash]:
-        """Every light accepted so far, best first."""
+        """Every light accepted so far, best first; what has come since the last decision is decided on."""
+        if self._block_frames >= _FEW or (self._block_frames and not self.tracks):
+            self._decide(self._times[-1][1])
         seen = [(track, spot) for track in self.tracks if (spot := self.spot(track)) is not None]
         lamps = [Lamp(np.array(track.looks), spot.peak * spot.width**2, spot.width) for track, spot in seen]
         config = self.config
@@ -242,8 +244,11 @@ class FlashDetector:
 
     def _window_s(self) -> float:
         """Length of the light curves in seconds: what the ring holds, within limits."""
-        pace = (self._times[-1][1] - self._times[0][1]) / max(len(self._times) - 1, 1)
-        return float(np.clip(0.9 * _RING * pace, self.config.window_s, _LONGER * self.config.window_s))
+        return float(np.clip(0.9 * _RING * self._pace(), self.config.window_s, _LONGER * self.config.window_s))
+
+    def _pace(self) -> float:
+        """Mean time between the frames in the ring."""
+        return (self._times[-1][1] - self._times[0][1]) / max(len(self._times) - 1, 1)
 
     # ---- each frame --------------------------------------------------------------------------------------------------
 
@@ -254,7 +259,7 @@ class FlashDetector:
         self._differences = np.zeros((depth, *shape), np.int8)
         self._total = np.zeros(shape, np.int16)
         self._window = np.zeros(shape, np.int32)  # sum of the blocks
-        self._decided = t
+        self._due = t + self.config.decision_s
 
     def _accumulate(self, frame: NDArray[np.uint8], t: float) -> None:
         assert self._ring is not None
@@ -309,8 +314,7 @@ class FlashDetector:
         self._window += self._total
         self._total = np.zeros_like(self._total)
         self._block_frames = 0
-        self._decided = t
-        while len(self._blocks) * self.config.decision_s > self._window_s() + self.config.decision_s / 2:
+        while sum(count for count, _ in self._blocks) * self._pace() > self._window_s() + self.config.decision_s:
             self._window -= self._blocks.popleft()[1]
         if t - self._times[0][1] < 1.4 * self.config.pattern.period:
             return
@@ -457,7 +461,8 @@ class FlashDetector:
             top, left = max(0, _BEFORE - track.row), max(0, _BEFORE - track.column)
             inside = np.s_[top : height + _BEFORE - track.row, left : width + _BEFORE - track.column]
             image = track.numerator / max(track.weight, 1e-9)
-            spot = fit_spot(image[inside], variance[inside], ~track.clipped[inside], pitch=2)
+            middle = 2.0 * (_BEFORE - left) + 1.5, 2.0 * (_BEFORE - top) + 1.5
+            spot = fit_spot(image[inside], variance[inside], ~track.clipped[inside], pitch=2, start=middle)
             if spot is not None:
                 shift = track.shift / max(track.weight, 1e-9) - self._shift_sum / max(self._count, 1)
                 u = spot.u + 2.0 * (track.column - _BEFORE + left) - shift[0]

@@ -140,6 +140,34 @@ def cut_patches(
         patches[n] = image[i : i + height, j : j + width]
 
 
+def project_runs(
+    values: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    waves: NDArray[np.float32],
+    first: NDArray[np.intp],
+    last: NDArray[np.intp],
+    projection: NDArray[np.float32],
+    sums: NDArray[np.float32],
+    squares: NDArray[np.float32],
+) -> None:
+    """Correlate N light curves with the pattern's single period at S starts.
+
+    Parameters
+    ----------
+    values, weights : (N, F) float32
+        Light curves, zero where their weight is.
+    waves : (F, S) float32
+        Share of each exposure in which a pattern that begins at each start is on.
+    first, last : (F,) intp
+        Starts [first, last) at which that is not zero; they save work.
+    projection, sums, squares : (N, S) float32, out
+        Sums over the frames of values * waves, weights * waves, and weights * waves^2.
+    """
+    projection[:] = values @ waves
+    sums[:] = weights @ waves
+    squares[:] = weights @ waves**2
+
+
 def best_runs(
     projection: NDArray[np.float32],
     sums: NDArray[np.float32],

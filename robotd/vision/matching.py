@@ -185,9 +185,12 @@ class Matcher:
         y = weights * _without(values, weights, basis)
         energy = np.einsum("nf,nf->n", y, y).astype(float) + 1e-6
         places = len(y)
-        projection: Singles = np.asarray(y @ single.T, np.float32)
-        sums = weights @ single.T
-        squares = weights @ (single * single).T
+        projection, sums, squares = (np.empty((places, len(starts)), np.float32) for _ in range(3))
+        waves = np.ascontiguousarray(single.T)
+        touched = waves > 0.0
+        first = np.argmax(touched, axis=1)
+        last = len(starts) - np.argmax(touched[:, ::-1], axis=1)
+        kernels.project_runs(np.ascontiguousarray(y), weights, waves, first, last, projection, sums, squares)
         gain, light = np.empty(places, np.float32), np.empty(places, np.float32)
         start, periods = np.empty(places, np.intp), np.empty(places, np.intp)
         kernels.best_runs(projection, sums, squares, self._step, frames, _LEAST, gain, start, periods, light)
@@ -255,8 +258,11 @@ def _without(values: Singles, weights: Singles, basis: Singles) -> Singles:
         mean = np.einsum("nf,nf->n", values, weights) / np.maximum(weights.sum(axis=1), 1.0)
         return np.asarray(values - mean[:, None])
     b = basis.astype(float)
-    normal = np.einsum("nf,fa,fb->nab", weights.astype(float), b, b, optimize=True) + 1e-3 * np.eye(b.shape[1])
-    right = (weights * values).astype(float) @ b
+    products = (b[:, :, None] * b[:, None, :]).reshape(len(b), -1)
+    # no matrix product: its library would wake threads for it, which cost more than they save
+    normal = np.einsum("nf,fk->nk", weights, products).reshape(len(values), *2 * b.shape[1:])
+    normal += 1e-3 * np.eye(b.shape[1])
+    right = np.einsum("nf,fk->nk", weights * values, b)
     factors = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
     return np.asarray(values - factors @ b.T, np.float32)
 
@@ -264,17 +270,17 @@ def _without(values: Singles, weights: Singles, basis: Singles) -> Singles:
 def _explained(y: Singles, weights: Singles, waves: Singles) -> Floats:
     """Energy (N,) that waves (B, F) explain of light curves which are zero where their weight is."""
     products = (waves[:, None, :] * waves[None, :, :]).reshape(-1, waves.shape[1])
-    normal = (weights @ products.T).reshape(len(y), len(waves), len(waves)).astype(float)
+    normal = np.einsum("nf,kf->nk", weights, products).reshape(len(y), len(waves), len(waves)).astype(float)
     # because sampled waves may be aliases of one another
     normal += 1e-3 * np.maximum(weights.sum(axis=1), 1.0)[:, None, None] * np.eye(len(waves))
-    right = (y @ waves.T).astype(float)
+    right = np.einsum("nf,kf->nk", y, waves).astype(float)
     factors = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
     return np.asarray(2.0 * np.einsum("nb,nb->n", factors, right) - np.einsum("na,nab,nb->n", factors, normal, factors))
 
 
 def _spread(residual: Singles, seen: NDArray[np.bool_]) -> Floats:
     """Robust standard deviation (N,) of what counts."""
-    away = np.where(seen, np.abs(residual), np.nan)
-    with np.errstate(all="ignore"):
-        middle = np.nanmedian(np.where(seen.any(axis=1, keepdims=True), away, 0.0), axis=1)
-    return np.asarray(1.48 * middle + 1e-3)
+    away = np.sort(np.where(seen, np.abs(residual), np.inf), axis=1)
+    count = seen.sum(axis=1)
+    middle = away[np.arange(len(away)), np.maximum(count - 1, 0) // 2]
+    return np.asarray(1.48 * np.where(count > 0, middle, 0.0) + 1e-3)

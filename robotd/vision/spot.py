@@ -44,7 +44,9 @@ def grey_difference(base: float, light: float, gamma: float) -> float:
     return float(255.0 * (bright ** (1.0 / gamma) - dark ** (1.0 / gamma)))
 
 
-def fit_spot(image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: int = 1) -> Spot | None:
+def fit_spot(
+    image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: int = 1, start: tuple[float, float] | None = None
+) -> Spot | None:
     """Fit a round Gaussian on a constant to the image of a light's amplitude.
 
     Parameters
@@ -52,9 +54,11 @@ def fit_spot(image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: i
     image, variance : (K, L) array
         Amplitude per cell and its variance.
     valid : (K, L) bool array
-        False where a cell must not count, for instance because it was clipped.
+        False where a cell was clipped: there the light is at least as strong as the image says.
     pitch : int
         Pixels per cell; a cell is the mean of pitch x pitch pixels.
+    start : (float, float), optional
+        Where u, v may be, in pixels; without it the fit starts at the centroid of what is bright.
 
     Returns
     -------
@@ -66,46 +70,63 @@ def fit_spot(image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: i
     Notes
     -----
     Levenberg-Marquardt on peak, u, v, log width and constant. The Gaussian is evaluated at pixel centres and averaged
-    over the cell.
+    over the cell. Clipped cells are censored observations: they count where the model falls below them.
     """
-    weights = np.where(valid, 1.0 / np.maximum(variance, 1e-12), 0.0)
-    if np.count_nonzero(weights) < 12:
+    if np.count_nonzero(valid) < 12:
         return None
+    weights = 1.0 / np.maximum(variance, 1e-12)
+    best: tuple[float, Floats, Floats] | None = None
+    for guess in _starts(image, valid, pitch, start):
+        found = _descend(guess, image, weights, valid, pitch)
+        if best is None or found[0] < best[0]:
+            best = found
+    assert best is not None
+    cost, parameters, normal = best
+    peak, u, v, log_width, _ = parameters
+    if peak <= 0.0 or not (0.0 < u < image.shape[1] * pitch - 1.0 and 0.0 < v < image.shape[0] * pitch - 1.0):
+        return None
+    scale = max(1.0, cost / max(1, int(np.count_nonzero(valid)) - 5))
+    covariance = np.linalg.inv(normal + np.diag(1e-9 * np.diag(normal) + 1e-15))[1:3, 1:3] * scale
+    return Spot(float(u), float(v), covariance.astype(np.float64), float(peak), float(np.exp(log_width)))
+
+
+def _descend(
+    parameters: Floats, image: Floats, weights: Floats, valid: NDArray[np.bool_], pitch: int
+) -> tuple[float, Floats, Floats]:
+    """Least squares from a first guess: cost, parameters and the normal matrix (5, 5)."""
     pixels = np.arange(image.shape[1] * pitch, dtype=float), np.arange(image.shape[0] * pitch, dtype=float)
-    parameters = _start(image, valid, weights, pitch)
-    damping = 1e-3
+    counted, cost = weights, np.inf
     residuals, jacobian = _model(parameters, image, pixels, pitch)
-    cost = float(np.sum(weights * residuals**2))
-    cells = int(np.count_nonzero(weights))
+
+    def weigh(residuals: Floats) -> tuple[Floats, float]:
+        counted = np.where(valid | (residuals > 0.0), weights, 0.0)
+        return counted, float(np.sum(counted * residuals**2))
+
+    counted, cost = weigh(residuals)
+    damping = 1e-3
     for _ in range(_ITERATIONS):
-        weighted = jacobian * weights.ravel()
+        weighted = jacobian * counted.ravel()
         normal = weighted @ jacobian.T
-        step = np.linalg.solve(normal + np.diag(damping * np.diag(normal) + 1e-12), weighted @ residuals.ravel())
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), weighted @ residuals.ravel())
         step[1:3] = np.clip(step[1:3], -1.0, 1.0)
         step[3] = np.clip(step[3], -0.5, 0.5)
         trial = parameters + step
         trial[3] = np.clip(trial[3], *np.log(_WIDTH_LIMITS))
         new_residuals, new_jacobian = _model(trial, image, pixels, pitch)
-        new_cost = float(np.sum(weights * new_residuals**2))
+        new_counted, new_cost = weigh(new_residuals)
         if new_cost <= cost:
             settled = cost - new_cost < 1e-6 * cost + 1e-9
-            parameters, residuals, jacobian, cost = trial, new_residuals, new_jacobian, new_cost
+            parameters, residuals, jacobian, counted, cost = trial, new_residuals, new_jacobian, new_counted, new_cost
             damping = max(damping * 0.2, 1e-7)
             if settled:
                 break
         else:
             damping *= 8.0
-    peak, u, v, log_width, _ = parameters
-    if peak <= 0.0 or not (0.0 < u < image.shape[1] * pitch - 1.0 and 0.0 < v < image.shape[0] * pitch - 1.0):
-        return None
-    normal = (jacobian * weights.ravel()) @ jacobian.T
-    scale: float = max(1.0, cost / max(1, cells - 5))
-    covariance = np.linalg.inv(normal + np.diag(1e-9 * np.diag(normal) + 1e-15))[1:3, 1:3] * scale
-    return Spot(float(u), float(v), covariance.astype(np.float64), float(peak), float(np.exp(log_width)))
+    return cost, parameters, (jacobian * counted.ravel()) @ jacobian.T
 
 
-def _start(image: Floats, valid: NDArray[np.bool_], weights: Floats, pitch: int) -> Floats:
-    """First guess: constant from the border, centroid of what is well above it; clipped cells count as bright."""
+def _starts(image: Floats, valid: NDArray[np.bool_], pitch: int, start: tuple[float, float] | None) -> list[Floats]:
+    """First guesses: constant from the border, centroid of what is well above it; clipped cells count as bright."""
     border = np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
     constant = float(np.median(border))
     raised = np.where(valid, image - constant, 0.0)
@@ -113,10 +134,13 @@ def _start(image: Floats, valid: NDArray[np.bool_], weights: Floats, pitch: int)
     mass = np.where(valid, np.where(raised > 0.3 * top, raised, 0.0), top)
     rows, columns = ((np.arange(size) + 0.5) * pitch - 0.5 for size in image.shape)
     total = max(float(mass.sum()), 1e-12)
+    peak = top * (1.3 if np.all(valid) else 2.0)
     u = float((mass.sum(axis=0) * columns).sum() / total)
     v = float((mass.sum(axis=1) * rows).sum() / total)
-    peak = top * (1.3 if np.all(valid) else 2.0)
-    return np.array([peak, u, v, np.log(1.1), constant])
+    guesses = [np.array([peak, u, v, np.log(1.1), constant])]
+    if start is not None:
+        guesses.append(np.array([peak, *start, np.log(1.1), constant]))
+    return guesses
 
 
 def _model(parameters: Floats, image: Floats, pixels: tuple[Floats, Floats], pitch: int) -> tuple[Floats, Floats]:
