@@ -61,7 +61,7 @@ cdef class Descent(Normals):
 
     def solve(
         self, const double[::1] frame, const double[:, ::1] points, int shape, double sigma, double width,
-        double move_width, int iterations, double tolerance,
+        double move_width, int iterations, double tolerance, double damping=1e-4,
     ):
         """Descend: frame (F,), points (l, 3), cost, iterations, converged. See Adjustment.solve."""
         cdef Shape loss
@@ -75,7 +75,7 @@ cdef class Descent(Normals):
         self._analyse()
         with nogil:
             self._ordered(&points[0, 0], self.points)
-            spent = self._descend(&end[0], self.points, &loss, iterations, tolerance, &converged)
+            spent = self._descend(&end[0], self.points, &loss, iterations, tolerance, damping, &converged)
             for l in range(self.labels):
                 for k in range(3):
                     end_points[self.label_at[l], k] = self.points[3 * l + k]
@@ -89,10 +89,11 @@ cdef class Descent(Normals):
         return 0
 
     cdef int _descend(
-        self, double* frame, double* points, const Shape* loss, int iterations, double tolerance, bint* converged
+        self, double* frame, double* points, const Shape* loss, int iterations, double tolerance, double damping,
+        bint* converged,
     ) noexcept nogil:
         cdef int iteration, k, entries = STOP * self.stops + CAMERA * self.cameras + 2
-        cdef double damping = 1e-4, predicted, cost, trial, ratio
+        cdef double predicted, cost, trial, ratio
         cdef Normal swapped
         self.factored = False
         self.evaluate(frame, points, loss, &self.now)

@@ -43,6 +43,7 @@ class Bundle:
         move_width: float,
         iterations: int,
         tolerance: float,
+        damping: float = 1e-4,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int, bool]: ...
     def covariance(
         self, frame: NDArray[np.float64], points: NDArray[np.float64]

@@ -352,7 +352,9 @@ class Adjustment:
         S[np.diag_indices(self.size)] += damping * np.diagonal(normal.H) + 1e-9
         return S, V_inverse, WV
 
-    def solve(self, state: State, loss: Loss, iterations: int = 30, tolerance: float = 1e-3) -> Solution:
+    def solve(
+        self, state: State, loss: Loss, iterations: int = 30, tolerance: float = 1e-3, damping: float = 1e-4
+    ) -> Solution:
         """Descend from a state until the predicted decrease of the cost falls below `tolerance`.
 
         Parameters
@@ -363,9 +365,12 @@ class Adjustment:
             Most linearisations to make.
         tolerance : float
             In units of the cost; not relative, because the weak modes of scale and heading move the cost very little.
+        damping : float
+            To begin with, relative to the diagonal. Little where the state is near the optimum: damping holds up the
+            weak modes most.
         """
         if self.kernel is None:
-            return self.solve_reference(state, loss, iterations, tolerance)
+            return self.solve_reference(state, loss, iterations, tolerance, damping)
         frame, moved, cost, spent, converged = self.kernel.solve(
             state.frame,
             state.points[self.labels],
@@ -375,14 +380,17 @@ class Adjustment:
             loss.move_width,
             iterations,
             tolerance,
+            damping,
         )
         points = state.points.copy()
         points[self.labels] = moved
         return Solution(replace(state, frame=frame, points=points), cost, spent, converged)
 
-    def solve_reference(self, state: State, loss: Loss, iterations: int = 30, tolerance: float = 1e-3) -> Solution:
+    def solve_reference(
+        self, state: State, loss: Loss, iterations: int = 30, tolerance: float = 1e-3, damping: float = 1e-4
+    ) -> Solution:
         """`solve` in numpy, whether or not there is a kernel."""
-        damping, linear = 1e-4, self.linearise(state, loss)
+        linear = self.linearise(state, loss)
         cost = self.cost(linear, state, loss)
         normal = self.normal(linear, state, loss)
         for iteration in range(1, iterations + 1):

@@ -30,6 +30,7 @@ FLOOR_M = -0.10  # a point lower than this is a reflection in the floor that the
 _FALLBACK_M = 1.5  # along the first ray of a label that cannot be triangulated
 _MOST_PAIRS = 190  # all pairs of 20 rays; more only repeat what those say
 _LEAST_PARALLAX = np.radians(0.3)
+_NEGLIGIBLE = 1e-3  # decrease of a move's loss
 _RAY_SIGMA = 0.01  # rad: tilt and calibration, which the epipolar step does not know
 
 
@@ -193,11 +194,14 @@ def epipolar_moves(problem: Problem, sightings: Sightings, guess: Floats | None 
             cost = losses(trial)
             best[cost < lowest] = trial[cost < lowest]
             lowest = np.minimum(cost, lowest)
-    damping = np.full(len(moves.before), 1e-3)
+    damping, idle = np.full(len(moves.before), 1e-3), 0
     for _ in range(18):
         trial = best + _epipolar_step(rays, best, moves.measured, root, damping)
         cost = losses(trial)
         better = cost < lowest
+        idle = 0 if (lowest - cost > _NEGLIGIBLE).any() else idle + 1
+        if idle == 3:  # the first of them may have been steps too long
+            break
         best[better], lowest[better] = trial[better], cost[better]
         damping = np.where(better, damping * 0.3, damping * 10.0)
     best[:, 2] = wrap_angle(best[:, 2])

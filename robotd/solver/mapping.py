@@ -24,10 +24,11 @@ from ..records import (
     Survey,
     Vector3,
 )
+from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
 from .initial import world_rays
 from .linear import solve_linear
-from .problem import Bools, Problem, Sightings, build_problem
+from .problem import Bools, Problem, Sightings, build_problem, stops_per_label
 from .robust import OUTLIER, Optimum, optimise
 
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
@@ -65,15 +66,16 @@ def solve(
     SolverError
         If there is nothing to solve.
     """
-    problem = build_problem(survey)
-    if method == "linear":
-        return solve_linear(problem)
-    if method != "bundle":
+    if method not in ("bundle", "linear"):
         raise ValueError(f"method must be bundle or linear, got {method!r}")
-    poses = None
-    if start is not None:
-        poses = np.array([pose_array(start[stop.leg, stop.stop]) for stop in problem.survey.stops])
-    return _to_map(problem, optimise(problem, poses))
+    with many_records():
+        problem = build_problem(survey)
+        if method == "linear":
+            return solve_linear(problem)
+        poses = None
+        if start is not None:
+            poses = np.array([pose_array(start[stop.leg, stop.stop]) for stop in problem.survey.stops])
+        return _to_map(problem, optimise(problem, poses))
 
 
 def _to_map(asked: Problem, optimum: Optimum) -> Map:
@@ -81,10 +83,10 @@ def _to_map(asked: Problem, optimum: Optimum) -> Map:
     everything = Adjustment(problem, problem.sightings)
     linear = everything.residuals(state, SQUARE)
     square = (linear.residual**2).sum(axis=1)
-    counts = Counter(s.label for stop in problem.survey.stops for s in stop.sightings)
+    counts = Counter(problem.columns.names)
     tally = _tally(asked, optimum)
     labels = tuple(_label(asked, optimum, tally, i, counts[label]) for i, label in enumerate(problem.labels))
-    located = {m.label for m in labels if m.status in ("placed", "known")}
+    located = np.array([m.status in ("placed", "known") for m in labels], dtype=np.bool_)
     residual_px = linear.residual * problem.sightings.sigma[:, None]
     inlier = optimum.inlier
     used = residual_px[inlier]
@@ -116,7 +118,8 @@ class _Tally:
     """Of every label: how many stops saw it, saw it from where the map reaches, and agree; and what speaks for it.
 
     `row` is its place in the adjustment or -1, `known` in the problem's known labels or -1, `sigma` its largest
-    standard deviation, `agreeing` and `doubting` sums of its sightings' probabilities, `in_front` (L, 3) see _in_front.
+    standard deviation, `position` and `covariance` as in the map, the latter by row, `agreeing` and `doubting` sums of
+    its sightings' probabilities, `in_front` (L, 3) see _in_front.
     """
 
     asked_stops: list[int]
@@ -128,6 +131,8 @@ class _Tally:
     row: list[int]
     known: list[int]
     sigma: list[float]
+    position: list[Vector3]
+    covariance: list[Matrix3]
     in_front: Floats
     image: list[bool]
 
@@ -145,8 +150,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
     image: list[bool] = np.isfinite(in_front[:, 0]).tolist()
 
     def stops(sightings: Sightings) -> list[int]:
-        pairs = np.unique(sightings.label * problem.stop_count + sightings.stop)
-        counts: list[int] = np.bincount(pairs // problem.stop_count, minlength=count).tolist()
+        counts: list[int] = stops_per_label(sightings.label, sightings.stop, count).tolist()
         return counts
 
     return _Tally(
@@ -159,6 +163,10 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
         row=row.tolist(),
         known=known.tolist(),
         sigma=sigma.tolist(),
+        position=[(x, y, z) for x, y, z in optimum.state.points.tolist()],
+        covariance=[
+            ((a, b, c), (d, e, f), (g, h, i)) for (a, b, c), (d, e, f), (g, h, i) in optimum.covariance.points.tolist()
+        ],
         in_front=in_front,
         image=image,
     )
@@ -167,17 +175,15 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
 def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int) -> MappedLabel:
     problem, label = optimum.problem, asked.labels[i]
     inliers = tally.inliers[i]
-    position, covariance = _vector(optimum.state.points[i]), None
-    if tally.row[i] >= 0:
-        covariance = optimum.covariance.points[tally.row[i]]
+    position, covariance = tally.position[i], tally.covariance[row] if (row := tally.row[i]) >= 0 else None
 
     def unplaced(reason: str) -> MappedLabel:
         return MappedLabel(label, "unplaced", None, None, count, inliers, reason)
 
     if (k := tally.known[i]) >= 0:
         if covariance is None:
-            position, covariance = _vector(problem.known.position[k]), problem.known.sigma[k] ** 2 * np.eye(3)
-        return MappedLabel(label, "known", position, _matrix(covariance), count, inliers)
+            position, covariance = _vector(problem.known.position[k]), _matrix(problem.known.sigma[k] ** 2 * np.eye(3))
+        return MappedLabel(label, "known", position, covariance, count, inliers)
     if count == 0:
         return unplaced("its measured position was rejected and no camera saw it; measure it again")
     if tally.asked_stops[i] == 0:
@@ -201,7 +207,7 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int) 
     if tally.image[i]:
         reason = "perhaps an image in glass: one sighting puts the label nearer; map it from another stop"
         return _ambiguous(optimum, i, label, count, inliers, tally.in_front[i], reason)
-    return MappedLabel(label, "placed", position, _matrix(covariance), count, inliers)
+    return MappedLabel(label, "placed", position, covariance, count, inliers)
 
 
 def _in_front(optimum: Optimum) -> Floats:
@@ -279,21 +285,28 @@ def _stops(optimum: Optimum) -> tuple[MappedStop, ...]:
 
 
 def _sightings(
-    problem: Problem, residual_px: Floats, valid: Bools, weight: Floats, located: set[str]
+    problem: Problem, residual_px: Floats, valid: Bools, weight: Floats, located: Bools
 ) -> tuple[MappedSighting, ...]:
-    rows: dict[int, int] = {source: row for row, source in enumerate(problem.sightings.source.tolist())}
-    residuals, shown, shares = residual_px.tolist(), valid.tolist(), weight.tolist()
-    result = []
-    everything = ((stop, s) for stop in problem.survey.stops for s in stop.sightings)
-    for number, (stop, s) in enumerate(everything):
-        row = rows.get(number, -1)
-        residual = None
-        if row >= 0 and shown[row] and s.label in located:
-            u, v = residuals[row]
-            residual = (u, v)
-        share = shares[row] if row >= 0 else 0.0
-        result.append(MappedSighting(stop.leg, stop.stop, s.camera, s.label, residual, share))
-    return tuple(result)
+    """What became of every sighting of the survey, in its order."""
+    s, columns, stops = problem.sightings, problem.columns, problem.survey.stops
+    residuals: list[tuple[float, float] | None] = [None] * len(columns.stop)
+    shown = valid & located[s.label]
+    for number, u, v in zip(s.source[shown].tolist(), *residual_px[shown].T.tolist(), strict=True):
+        residuals[number] = (u, v)
+    weights = np.zeros(len(columns.stop))
+    weights[s.source] = weight
+    cameras = [camera.name for camera in problem.cameras]
+    return tuple(
+        map(
+            MappedSighting,
+            np.array([stop.leg for stop in stops])[columns.stop].tolist(),
+            np.array([stop.stop for stop in stops])[columns.stop].tolist(),
+            map(cameras.__getitem__, columns.camera.tolist()),
+            columns.names,
+            residuals,
+            weights.tolist(),
+        )
+    )
 
 
 def _vector(values: Floats) -> Vector3:

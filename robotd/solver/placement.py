@@ -89,9 +89,14 @@ def _assemble(
     return retriangulate(problem, state, tolerance, np.isin(segment, list(axes)))
 
 
-def retriangulate(problem: Problem, state: State, tolerance: float, placed: Bools) -> tuple[State, Bools]:
-    """Triangulate every label again from the state's poses; points that cannot be found stay where they were."""
-    sightings = problem.sightings.select(placed[problem.sightings.stop])
+def retriangulate(
+    problem: Problem, state: State, tolerance: float, placed: Bools, labels: Ints | None = None
+) -> tuple[State, Bools]:
+    """Triangulate labels again, all or some, from the state's poses; points that cannot be found stay as they were."""
+    chosen = placed[problem.sightings.stop]
+    if labels is not None:
+        chosen &= np.isin(problem.sightings.label, labels)
+    sightings = problem.sightings.select(chosen)
     origin, direction = world_rays(problem, sightings, state)
     points, found = triangulate(
         origin, direction, sightings.label, sightings.stop, sightings.probability, len(problem.labels), tolerance

@@ -13,6 +13,7 @@ fixed: they have no column in the normal equations, so that a planar problem cos
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
-from ..records import Floats, Survey
+from ..records import Floats, Matrix3, Survey
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -105,6 +106,42 @@ class State:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """All sightings of a survey, in its order: (N,) arrays, `camera` -1 where the rig has none of that name."""
+
+    stop: Ints
+    camera: Ints
+    names: list[str]
+    uv: Floats
+    sigma: Floats
+    probability: Floats
+
+    @classmethod
+    def of(cls, survey: Survey) -> Columns:
+        """The columns of a survey; defaults stand in for what is not given."""
+        rows = [s for stop in survey.stops for s in stop.sightings]
+        cameras = {camera.name: i for i, camera in enumerate(survey.rig.cameras)}
+        default = survey.sigmas.pixel_px if survey.sigmas.pixel_px > 0.0 else 1.0
+        count, uv = len(rows), np.empty((len(rows), 2))
+        for k, name in enumerate(("u", "v")):
+            uv[:, k] = np.fromiter(map(attrgetter(name), rows), np.float64, count)
+        return cls(
+            stop=np.repeat(np.arange(len(survey.stops)), [len(stop.sightings) for stop in survey.stops]),
+            camera=np.fromiter((cameras.get(s.camera, -1) for s in rows), np.int64, count),
+            names=[s.label for s in rows],
+            uv=uv,
+            sigma=np.fromiter((default if s.sigma_px is None else s.sigma_px for s in rows), np.float64, count),
+            probability=np.fromiter((1.0 if s.probability is None else s.probability for s in rows), np.float64, count),
+        )
+
+    def suspects(self, stops: int) -> Bools:
+        """(S,) which stops have sightings that cannot be used."""
+        good = (self.camera >= 0) & np.isfinite(self.uv).all(axis=1) & np.isfinite(self.probability)
+        good &= np.isfinite(self.sigma) & (self.sigma > 0.0)
+        return np.bincount(self.stop[~good], minlength=stops) > 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """Everything the solver computes with; indices count stops in the survey's order and labels as in `labels`.
 
@@ -114,6 +151,7 @@ class Problem:
     """
 
     survey: Survey
+    columns: Columns
     cameras: tuple[Camera, ...]
     R_robot_camera: Floats
     t_robot_camera: Floats
@@ -158,11 +196,11 @@ def build_problem(survey: Survey) -> Problem:
     """
     if not survey.stops:
         raise SolverError(f"survey {survey.survey}: it has no stops, so there is nothing to map")
-    _check(survey)
     survey = replace(survey, stops=tuple(sorted(survey.stops, key=lambda stop: (stop.leg, stop.stop))))
+    columns = _check(survey)
     cameras = tuple(Camera(model) for model in survey.rig.cameras)
-    labels = sorted({s.label for stop in survey.stops for s in stop.sightings} | {k.label for k in survey.known_labels})
-    sightings, notes = _sightings(survey, cameras, labels)
+    labels = sorted({*columns.names, *(known.label for known in survey.known_labels)})
+    sightings, notes = _sightings(columns, cameras, labels)
     moves, gaps = _moves(survey)
     known = _known(survey, labels)
     roofs = _roofs(survey)
@@ -176,6 +214,7 @@ def build_problem(survey: Survey) -> Problem:
         roofs = roofs.select(np.zeros(len(roofs.stop), dtype=np.bool_))
     return Problem(
         survey=survey,
+        columns=columns,
         cameras=cameras,
         R_robot_camera=np.array([c.T_robot_camera[:3, :3] for c in cameras]).reshape(-1, 3, 3),
         t_robot_camera=np.array([c.T_robot_camera[:3, 3] for c in cameras]).reshape(-1, 3),
@@ -192,10 +231,11 @@ def build_problem(survey: Survey) -> Problem:
     )
 
 
-def _check(survey: Survey) -> None:
+def _check(survey: Survey) -> Columns:
+    """Raise InputError if the survey contradicts itself; returns its sightings as columns."""
     problems: list[str] = []
     names = [camera.name for camera in survey.rig.cameras]
-    known_names, roofs = set(names), {roof.name for roof in survey.roof_cameras}
+    roofs = {roof.name for roof in survey.roof_cameras}
     where = f"survey {survey.survey}"
     if len(set(names)) < len(names):
         problems.append(f"{where}: two cameras of the rig have the same name; names are {', '.join(names)}")
@@ -214,7 +254,9 @@ def _check(survey: Survey) -> None:
     problems += [f"{where}: known label {i} is listed twice" for i in sorted({i for i in ids if ids.count(i) > 1})]
     seen: set[tuple[int, int]] = set()
     unknown: set[str] = set()
-    for stop in survey.stops:
+    columns = Columns.of(survey)
+    suspect = columns.suspects(len(survey.stops))
+    for index, stop in enumerate(survey.stops):
         at = f"{where}: leg {stop.leg} stop {stop.stop}"
         if (stop.leg, stop.stop) in seen:
             problems.append(f"{at} is there twice; remove one")
@@ -224,17 +266,9 @@ def _check(survey: Survey) -> None:
             numbers += [stop.move.dx, stop.move.dy, stop.move.dheading, *np.ravel(stop.move.covariance)]
         if not np.isfinite(numbers).all():
             problems.append(f"{at}: odometry and move must be finite numbers, got {stop.odometry} and {stop.move}")
-        elif stop.move is not None and np.linalg.eigvalsh(np.array(stop.move.covariance)).min() < -1e-9:
+        elif stop.move is not None and not _semidefinite(stop.move.covariance):
             problems.append(f"{at}: the move's covariance is not positive semidefinite")
-        # all numbers at once, because a large survey has a hundred thousand sightings
-        rows = np.array(
-            [(s.u, s.v, 1.0 if s.sigma_px is None else s.sigma_px, s.probability or 0.0) for s in stop.sightings]
-        )
-        if not len(rows) or (np.isfinite(rows).all() and (rows[:, 2] > 0.0).all()):
-            wrong = tuple(s for s in stop.sightings if s.camera not in known_names)
-        else:
-            wrong = stop.sightings
-        for s in wrong:
+        for s in stop.sightings if suspect[index] else ():
             if s.camera not in names and s.camera not in unknown:
                 unknown.add(s.camera)
                 expected = ", ".join(names) or "no cameras"
@@ -249,20 +283,15 @@ def _check(survey: Survey) -> None:
                 problems.append(f"{at}: beacon {b.beacon}: u, v must be finite and sigma_px positive, got {b}")
     if problems:
         raise InputError(*problems)
+    return columns
 
 
-def _sightings(survey: Survey, cameras: tuple[Camera, ...], labels: list[str]) -> tuple[Sightings, list[str]]:
-    camera_index = {camera.name: i for i, camera in enumerate(cameras)}
+def _sightings(columns: Columns, cameras: tuple[Camera, ...], labels: list[str]) -> tuple[Sightings, list[str]]:
+    stop, camera, uv, sigma, probability = columns.stop, columns.camera, columns.uv, columns.sigma, columns.probability
+    rows = len(stop)
     label_index = {label: i for i, label in enumerate(labels)}
-    rows = [(f, s) for f, stop in enumerate(survey.stops) for s in stop.sightings]
-    default = survey.sigmas.pixel_px if survey.sigmas.pixel_px > 0.0 else 1.0
-    stop = np.repeat(np.arange(len(survey.stops)), [len(stop.sightings) for stop in survey.stops])
-    camera = np.array([camera_index[s.camera] for _, s in rows], dtype=np.int64)
-    label = np.array([label_index[s.label] for _, s in rows], dtype=np.int64)
-    uv = np.array([[s.u, s.v] for _, s in rows]).reshape(-1, 2)
-    sigma = np.array([default if s.sigma_px is None else s.sigma_px for _, s in rows])
-    probability = np.array([1.0 if s.probability is None else s.probability for _, s in rows])
-    origin, direction, usable = np.zeros((len(rows), 3)), np.zeros((len(rows), 3)), np.zeros(len(rows), dtype=np.bool_)
+    label = np.fromiter(map(label_index.__getitem__, columns.names), np.int64, rows)
+    origin, direction, usable = np.zeros((rows, 3)), np.zeros((rows, 3)), np.zeros(rows, dtype=np.bool_)
     for c, model in enumerate(cameras):
         mine = camera == c
         rays, valid = model.rays(uv[mine])
@@ -272,7 +301,7 @@ def _sightings(survey: Survey, cameras: tuple[Camera, ...], labels: list[str]) -
     notes = []
     if not usable.all():
         notes.append(
-            f"{np.count_nonzero(~usable)} of {len(rows)} sightings lie where the lens model cannot be inverted "
+            f"{np.count_nonzero(~usable)} of {rows} sightings lie where the lens model cannot be inverted "
             "(beyond its valid radius) and were not used"
         )
     _, rival = np.unique((stop * len(cameras) + camera) * (len(labels) + 1) + label, return_inverse=True)
@@ -284,12 +313,19 @@ def _sightings(survey: Survey, cameras: tuple[Camera, ...], labels: list[str]) -
         sigma=np.maximum(sigma, SIGMA_FLOOR_PX),
         probability=np.clip(probability, 0.01, 1.0),
         rival=rival.astype(np.int64).ravel(),
-        source=np.arange(len(rows)),
+        source=np.arange(rows),
         origin=origin,
         direction=direction,
     )
     order = np.argsort(camera, kind="stable")
     return everything.select(order[usable[order]]), notes
+
+
+def _semidefinite(rows: Matrix3) -> bool:
+    """Whether a covariance is one, within rounding."""
+    (a, b, c), (_, e, f), (_, _, i) = rows
+    minors = a, a * e - b * b, a * (e * i - f * f) - b * (b * i - f * c) + c * (b * f - e * c)
+    return min(minors) > 0.0 or bool(np.linalg.eigvalsh(np.array(rows)).min() >= -1e-9)
 
 
 def _moves(survey: Survey) -> tuple[Moves, list[str]]:
@@ -333,6 +369,14 @@ def _known(survey: Survey, labels: list[str]) -> Known:
         position=np.array([k.position for k in survey.known_labels]).reshape(-1, 3),
         sigma=np.array([max(k.sigma_m, 1e-5) for k in survey.known_labels]),
     )
+
+
+def stops_per_label(labels: Ints, stops: Ints, label_count: int) -> Ints:
+    """From how many different stops each label was seen, given the label and stop (N,) of sightings."""
+    pairs = np.sort(labels * (int(stops.max(initial=0)) + 1) + stops)
+    first = np.ones(len(pairs), dtype=np.bool_)
+    first[1:] = pairs[1:] != pairs[:-1]
+    return np.bincount(pairs[first] // (int(stops.max(initial=0)) + 1), minlength=label_count)
 
 
 def anchors(known: Known, sightings: Sightings) -> bool:

@@ -18,13 +18,15 @@ from .bundle import SQUARE, Adjustment, Loss, Solution
 from .covariance import Covariance, covariance
 from .initial import epipolar_moves, triangulate, world_rays
 from .placement import Placement, at_first_stop, detach, place, retriangulate
-from .problem import Bools, Ints, Known, Problem, State, anchors
+from .problem import Bools, Ints, Known, Problem, State, anchors, stops_per_label
 
 OUTLIER = 20.0  # squared whitened residual, 2 degrees of freedom: one right sighting in 20 000 exceeds it
 _SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
 _SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # what a slipped move still says: one wheel spun for some centimetres
 _WRONG_KNOWN = 25.0
 _REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tell them apart, slack on the lens
+_EXPLAINED = 0.25  # weight of a sighting under that loss from which it counts as explained
+_ENOUGH = 20  # sightings at a stop, to begin with
 _CLEAN = 0.97  # share of sightings explained at which no other start can do better
 _SAME = 0.5  # difference of two starts' costs below which they found the same minimum
 _FLOOR_IMAGE_PX = 6.0
@@ -109,7 +111,7 @@ def _best_start(problem: Problem, start: Floats | None) -> tuple[Problem, Placem
         solution, spent = _descend(problem, placement, schedule)
         iterations += spent
         cost = solution.cost + 1e6 * np.count_nonzero(~placement.placed)
-        agreed = best is not None and abs(cost - best[0]) < _SAME
+        agreed = best is not None and abs(cost - best[0]) < max(_SAME, 1e-4 * len(problem.sightings))
         if best is None or cost < best[0]:
             best = (cost, placement, solution)
         if agreed or _explained(problem, placement, solution.state) > _CLEAN:
@@ -121,18 +123,31 @@ def _best_start(problem: Problem, start: Floats | None) -> tuple[Problem, Placem
 def _descend(problem: Problem, placement: Placement, schedule: _Schedule) -> tuple[Solution, int]:
     attached = detach(problem, placement.placed)
     adjustment = Adjustment(attached, attached.sightings)
-    state, iterations = placement.state, 0
+    state, iterations, count = placement.state, 0, len(attached.sightings)
+    few = _thinned(attached, adjustment)
     for loss in schedule.losses:
-        solution = adjustment.solve(state, loss, iterations=12, tolerance=1.0)
+        solution = few.solve(state, loss, iterations=12, tolerance=max(1.0, 1e-4 * count))
         state, iterations = solution.state, iterations + solution.iterations
     everywhere = np.ones(problem.stop_count, dtype=np.bool_)
     for k, loss in enumerate(_TAIL):
-        if k < 2:
+        if k == 0:
             state, _ = retriangulate(attached, state, _ray_tolerance(attached), everywhere)
+        elif k == 1:
+            doubtful = attached.sightings.label[_weights(adjustment, state) < _EXPLAINED]
+            state, _ = retriangulate(attached, state, _ray_tolerance(attached), everywhere, np.unique(doubtful))
         last = k == len(_TAIL) - 1
-        solution = adjustment.solve(state, loss, iterations=25 if last else 12, tolerance=1e-2 if last else 0.3)
+        tolerance = max(1e-2, 1e-5 * count) if last else max(0.3, 1e-4 * count)
+        solution = adjustment.solve(state, loss, iterations=25 if last else 12, tolerance=tolerance, damping=1e-6)
         state, iterations = solution.state, iterations + solution.iterations
     return solution, iterations
+
+
+def _thinned(problem: Problem, adjustment: Adjustment) -> Adjustment:
+    """Every so many of the labels, where stops see many: as many as it takes to straighten the path."""
+    stride = len(problem.sightings) // (_ENOUGH * problem.stop_count)
+    if stride < 2:
+        return adjustment
+    return Adjustment(problem, problem.sightings.select(problem.sightings.label % stride == 0))
 
 
 def _ray_tolerance(problem: Problem) -> float:
@@ -145,19 +160,26 @@ def _ray_tolerance(problem: Problem) -> float:
 
 def _explained(problem: Problem, placement: Placement, state: State) -> float:
     attached = detach(problem, placement.placed)
-    adjustment = Adjustment(attached, attached.sightings)
-    _, weight = _REFERENCE((adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1))
-    return float((weight > 0.25).mean()) if len(weight) else 1.0
+    weight = _weights(Adjustment(attached, attached.sightings), state)
+    return float((weight > _EXPLAINED).mean()) if len(weight) else 1.0
+
+
+def _weights(adjustment: Adjustment, state: State) -> Floats:
+    """(N,) how far the state explains each sighting, 0 to 1."""
+    return _REFERENCE((adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1))[1]
 
 
 def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> Optimum:
     stated = problem.sightings.sigma
     problem = _rescaled(problem, _scatter(problem, state))
     everything = Adjustment(problem, problem.sightings)
-    solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=1e-2)
+    tolerance = max(1e-2, 1e-5 * len(problem.sightings))
+    solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=tolerance, damping=1e-6)
     iterations, state = iterations + solution.iterations, solution.state
-    state, _ = _out_of_glass(problem, state)
-    gain, rival_points, rival_gain = _hypotheses(problem, state)
+    state, reflected, hypotheses = _out_of_glass(problem, state)
+    if reflected.any():
+        hypotheses = _hypotheses(problem, state)
+    gain, rival_points, rival_gain = hypotheses
     better = rival_gain > gain
     better &= ~(_level(problem, state, rival_points) & _farther(problem, state, rival_points))
     if better.any():
@@ -171,8 +193,11 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         if factor == 1.0:
             break
         problem = _rescaled(problem, factor)
-    _, reflected = _out_of_glass(problem, state)
-    gain, rival_points, rival_gain = _hypotheses(problem, state, reflected)
+    kept = state
+    state, reflected, (gain, rival_points, rival_gain) = _out_of_glass(problem, state)
+    if state is not kept:  # a label that only now seems to be its image stays where it was adjusted
+        state = kept
+        gain, rival_points, rival_gain = _hypotheses(problem, state, reflected)
     factor = float(np.median(problem.sightings.sigma / stated)) if len(stated) else 1.0
     if factor > 1.0:
         note = f"sightings scatter {factor:.1f} times as much as their sigma_px says; uncertainties were scaled"
@@ -206,7 +231,7 @@ def _least_squares(problem: Problem, state: State) -> tuple[Problem, State, Bool
         # explained sightings count in full, however doubtful their identity looked to the robot
         certain = replace(problem.sightings.select(inlier), probability=np.ones(np.count_nonzero(inlier)))
         adjustment = Adjustment(problem, certain)
-        solution = adjustment.solve(state, SQUARE, iterations=30, tolerance=1e-4)
+        solution = adjustment.solve(state, SQUARE, iterations=30, tolerance=1e-4, damping=1e-8)
         state, iterations = solution.state, iterations + solution.iterations
     assert inlier is not None
     return problem, state, inlier, adjustment, iterations, solution.converged
@@ -221,8 +246,7 @@ def explained(everything: Adjustment, state: State) -> Bools:
     best = np.full(int(sightings.rival.max(initial=-1)) + 1, np.inf)
     np.minimum.at(best, sightings.rival, square)
     good &= square <= best[sightings.rival]
-    pairs = np.unique(sightings.label[good] * problem.stop_count + sightings.stop[good])
-    stops = np.bincount(pairs // problem.stop_count, minlength=len(problem.labels))
+    stops = stops_per_label(sightings.label[good], sightings.stop[good], len(problem.labels))
     stops[problem.known.label] += 1
     return np.asarray(good & (stops[sightings.label] >= 2))
 
@@ -301,7 +325,7 @@ def _rescaled(problem: Problem, factor: float) -> Problem:
     return replace(problem, sightings=replace(problem.sightings, sigma=problem.sightings.sigma * factor))
 
 
-def _out_of_glass(problem: Problem, state: State) -> tuple[State, Bools]:
+def _out_of_glass(problem: Problem, state: State) -> tuple[State, Bools, tuple[Floats, Floats, Floats]]:
     """Take labels out of the mirrors in which they were found.
 
     A label's image in a pane is as consistent as the label, and may be seen from more stops. But the robot and the
@@ -311,23 +335,25 @@ def _out_of_glass(problem: Problem, state: State) -> tuple[State, Bools]:
 
     Returns
     -------
-    state, reflected
-        With the labels at the nearer positions, and the sightings (N,) that the farther ones explain.
+    state, reflected, hypotheses
+        With the labels at the nearer positions, the sightings (N,) that the farther ones explain, and what else these
+        leave to be said (see `_hypotheses`). The state is the one given if no label was taken out.
     """
     reflected = np.zeros(len(problem.sightings), dtype=np.bool_)
     everything = Adjustment(problem, problem.sightings)
     for _ in range(_IMAGES):
-        gain, rivals, rival_gain = _hypotheses(problem, state, reflected)
+        gain, rivals, rival_gain = hypotheses = _hypotheses(problem, state, reflected)
         swap = _level(problem, state, rivals) & _nearer(problem, state, rivals) & (rival_gain > _CHANCE * gain)
         keep = _level(problem, state, rivals) & _farther(problem, state, rivals)
         if not (swap | keep).any():
-            break
+            return state, reflected, hypotheses
         images = np.where(keep[:, None], rivals, state.points)
         _, shown = _support(everything, replace(state, points=images))
-        state = replace(state, points=np.where(swap[:, None], rivals, state.points))
+        if swap.any():
+            state = replace(state, points=np.where(swap[:, None], rivals, state.points))
         _, direct = _support(everything, state)
         reflected |= (swap | keep)[problem.sightings.label] & shown & ~direct
-    return state, reflected
+    return state, reflected, _hypotheses(problem, state, reflected)
 
 
 def _level(problem: Problem, state: State, rivals: Floats) -> Bools:
@@ -384,8 +410,7 @@ def _hypotheses(problem: Problem, state: State, without: Bools | None = None) ->
     for loss in (Loss("geman-mcclure", 1.0), Loss("geman-mcclure")):
         trial = adjustment.solve(trial, loss, iterations=12, tolerance=1e-2).state
     rival_gain, fits = _support(everything, trial)
-    pairs = np.unique(problem.sightings.label[fits] * problem.stop_count + problem.sightings.stop[fits])
-    found &= np.bincount(pairs // problem.stop_count, minlength=count) >= 2
+    found &= stops_per_label(problem.sightings.label[fits], problem.sightings.stop[fits], count) >= 2
     found &= np.linalg.norm(trial.points - state.points, axis=1) > 0.05
     return gain, np.where(found[:, None], trial.points, np.nan), np.where(found, rival_gain, 0.0)
 
