@@ -24,12 +24,14 @@ import pytest
 import uvicorn
 
 from robotd.errors import InputError, SolverError
-from robotd.files import map_to_json, survey_from_json
+from robotd.files import map_from_json, map_to_json, survey_from_json, survey_to_json
 from robotd.journal import header_body, stop_body
 from robotd.records import CameraModel, Map, Move, Pose, Rig, Sighting, SolverRun, Stop, Survey, Transform
+from robotd.server import jobs
 from robotd.server.app import create_app, serve
 from robotd.server.jobs import JobError, MapJobs, worker_pool
 from robotd.server.store import ConflictError, Store, StoreError, UnknownSurveyError
+from tests.store_surveys import noisy_room
 
 TOKEN = "secret"
 CAMERA = CameraModel(
@@ -461,3 +463,29 @@ def test_the_solver_process_places_labels_from_stops_that_were_sent(tmp_path):
         server.process.kill()
         server.process.wait()  # its worker must not outlive it
         assert server.process.stdout.read() == ""
+
+
+def test_a_map_is_solved_as_soon_as_a_stop_comes(store):
+    begun = threading.Event()
+
+    def solve(survey, where):
+        begun.set()
+        return fake_solve(survey, where)
+
+    with running(store, solve=solve) as server:
+        put_survey(server, 1)
+        assert begun.wait(20)
+
+
+def test_a_survey_with_one_stop_more_grows_from_its_last_map(monkeypatch):
+    survey, _ = noisy_room()
+    monkeypatch.setattr(jobs, "_growing", {})
+    growing = []
+    for count in (4, 5, 7):
+        part = replace(survey, stops=survey.stops[:count])
+        result = map_from_json(jobs.solve_json(survey_to_json(part), "test"), "test")
+        assert len(result.stops) == count
+        growing.append(jobs._growing["test"])
+    assert growing[0] is growing[1] is growing[2]
+    jobs.solve_json(survey_to_json(replace(survey, created="2026-11-22T10:00:00Z")), "test")
+    assert jobs._growing["test"] is not growing[0]

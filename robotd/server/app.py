@@ -4,7 +4,7 @@
     PUT /api/surveys/{survey}/legs/{leg}/stops/{stop} one stop
     GET /api/surveys                                  names and numbers of stops
     GET /api/surveys/{survey}                         robotd-survey/1
-    GET /api/surveys/{survey}/map                     robotd-map/1, solved if stops came since the last one
+    GET /api/surveys/{survey}/map                     robotd-map/1 of all stops; solving begins when a stop comes
     GET /api/recordings                               names, sizes and hashes of the complete ones
     GET /api/recordings/{name}                        {"received": bytes, "complete": bool}
     PUT /api/recordings/{name}                        a piece, see below
@@ -98,7 +98,10 @@ def create_app(
         if not (0 < leg < 10**6 and 0 < stop < 10**6):
             raise InputError(f"survey {survey!r} leg {leg} stop {stop}: expected numbers from 1 to 999999")
         body = await _body(request)
-        return _taken(await asyncio.to_thread(store.put_stop, survey, leg, stop, body), body)
+        new = await asyncio.to_thread(store.put_stop, survey, leg, stop, body)
+        if new:
+            maps.begin(survey)
+        return _taken(new, body)
 
     @api.get("/surveys/{survey}")
     async def get_survey(survey: str) -> Response:

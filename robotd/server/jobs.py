@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ..errors import RobotdError
 from .store import Store
 
+if TYPE_CHECKING:
+    from ..records import Survey
+    from ..solver import GrowingMap
+
 Solve = Callable[[bytes, str], bytes]
+
+log = logging.getLogger("robotd.server")
+
+_MOST_GROWING = 4  # surveys at a time; a map of 1000 stops holds about 100 MB
+_growing: dict[str, GrowingMap] = {}  # in the worker process
 
 
 class JobError(RobotdError):
@@ -21,11 +33,30 @@ class JobError(RobotdError):
 
 
 def solve_json(survey: bytes, where: str) -> bytes:
-    """From `robotd-survey/1` to `robotd-map/1`; raises InputError or SolverError. Runs in the worker process."""
-    from ..files import map_to_json, survey_from_json
-    from ..solver import solve
+    """From `robotd-survey/1` to `robotd-map/1`; raises InputError or SolverError. Runs in the worker process.
 
-    return map_to_json(solve(survey_from_json(survey, where)))
+    The maps of the last surveys are kept, so that the map of a survey with one stop more grows from the last one.
+    """
+    from ..files import map_to_json, survey_from_json
+    from ..solver import GrowingMap
+
+    record = survey_from_json(survey, where)
+    growing = _growing.pop(record.survey, None)
+    if growing is None or not _continues(record, growing.survey):
+        growing = GrowingMap(record)
+    else:
+        for stop in record.stops[len(growing.survey.stops) :]:
+            growing.add_stop(stop)
+    result = map_to_json(growing.map())
+    _growing[record.survey] = growing
+    while len(_growing) > _MOST_GROWING:
+        del _growing[next(iter(_growing))]
+    return result
+
+
+def _continues(survey: Survey, earlier: Survey) -> bool:
+    """Whether it is the earlier survey with more stops at its end."""
+    return replace(survey, stops=survey.stops[: len(earlier.stops)]) == earlier
 
 
 def worker_pool() -> Executor:
@@ -53,6 +84,8 @@ class MapJobs:
         self._make = executor
         self._executor: Executor | None = None
         self._running: dict[tuple[str, str], asyncio.Task[bytes]] = {}
+        self._following: dict[str, asyncio.Task[None]] = {}
+        self._stale: set[str] = set()
 
     async def map(self, name: str) -> bytes:
         """The map of a survey as it is now, solved if need be.
@@ -87,9 +120,31 @@ class MapJobs:
         await asyncio.to_thread(self._store.put_map, name, revision, solved)
         return solved
 
+    def begin(self, name: str) -> None:
+        """Solve a survey as it is now in the background, so that its map is there when somebody asks for it.
+
+        While that takes its time, stops may come as they like: one more run then takes them all in.
+        """
+        self._stale.add(name)
+        if name not in self._following:
+            self._following[name] = asyncio.create_task(self._follow(name))
+
+    async def _follow(self, name: str) -> None:
+        try:
+            while name in self._stale:
+                self._stale.discard(name)
+                try:
+                    await self.map(name)
+                except RobotdError as error:  # whoever asks for the map will be told
+                    log.info("no map after the last stop: %s", error)
+                except Exception:
+                    log.exception("no map of survey %r after its last stop", name)
+        finally:
+            del self._following[name]
+
     def close(self) -> None:
         """Drop what is running."""
-        for task in self._running.values():
+        for task in (*self._running.values(), *self._following.values()):
             task.cancel()
         executor, self._executor = self._executor, None
         if executor is None:

@@ -75,10 +75,11 @@ def solve(
         poses = None
         if start is not None:
             poses = np.array([pose_array(start[stop.leg, stop.stop]) for stop in problem.survey.stops])
-        return _to_map(problem, optimise(problem, poses))
+        return to_map(problem, optimise(problem, poses))
 
 
-def _to_map(asked: Problem, optimum: Optimum) -> Map:
+def to_map(asked: Problem, optimum: Optimum) -> Map:
+    """The map that an optimum of a problem is."""
     problem, state = optimum.problem, optimum.state
     everything = Adjustment(problem, problem.sightings)
     linear = everything.residuals(state, SQUARE)

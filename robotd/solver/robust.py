@@ -82,59 +82,66 @@ class Optimum:
     converged: bool
 
 
-def optimise(problem: Problem, start: Floats | None = None) -> Optimum:
+def optimise(problem: Problem, start: Floats | None = None, grown: Placement | None = None) -> Optimum:
     """Find the poses, rig and points that explain the sightings, whatever else is among them.
 
-    `start` (S, 3) holds x, y, heading of every stop to begin from; by default those that odometry chains.
+    `start` (S, 3) holds x, y, heading of every stop to begin from; by default those that odometry chains. `grown` is
+    tried before all starts: a state near the optimum, for instance that of the same survey without its last stop.
     """
-    problem, placement, solution, iterations = _best_start(problem, start)
+    problem, placement, solution, iterations = _best_start(problem, start, grown)
     return _finish(detach(problem, placement.placed), placement.placed, solution.state, iterations)
 
 
-def _best_start(problem: Problem, start: Floats | None) -> tuple[Problem, Placement, Solution, int]:
+def _best_start(
+    problem: Problem, start: Floats | None, grown: Placement | None
+) -> tuple[Problem, Placement, Solution, int]:
     best: tuple[float, Placement, Solution] | None = None
     iterations = 0
     guess = problem.moves.measured
     if start is not None:
         guess = se2_relative(start[problem.moves.before], start[problem.moves.after])
-    for schedule in _SCHEDULES:
-        moves = epipolar_moves(problem, problem.sightings, guess) if schedule.epipolar else guess
-        placement = place(problem, moves, schedule.tolerance)
-        if not placement.placed.any():
-            # only outside references can leave every stop without a place
-            problem = at_first_stop(
-                problem,
-                f"the {problem.frame} could not be matched with the sightings, so the first stop fixes the world "
-                "frame; check their positions and names",
-            )
+    for schedule in (None, *_SCHEDULES) if grown is not None else _SCHEDULES:
+        if schedule is None:
+            assert grown is not None
+            placement = grown
+        else:
+            moves = epipolar_moves(problem, problem.sightings, guess) if schedule.epipolar else guess
             placement = place(problem, moves, schedule.tolerance)
-        solution, spent = _descend(problem, placement, schedule)
+            if not placement.placed.any():
+                # only outside references can leave every stop without a place
+                problem = at_first_stop(
+                    problem,
+                    f"the {problem.frame} could not be matched with the sightings, so the first stop fixes the world "
+                    "frame; check their positions and names",
+                )
+                placement = place(problem, moves, schedule.tolerance)
+        solution, spent = _descend(problem, placement, () if schedule is None else schedule.losses)
         iterations += spent
         cost = solution.cost + 1e6 * np.count_nonzero(~placement.placed)
         agreed = best is not None and abs(cost - best[0]) < max(_SAME, 1e-4 * len(problem.sightings))
         if best is None or cost < best[0]:
             best = (cost, placement, solution)
-        if agreed or _explained(problem, placement, solution.state) > _CLEAN:
+        if agreed or (placement.placed.all() and _explained(problem, placement, solution.state) > _CLEAN):
             break
     assert best is not None
     return problem, best[1], best[2], iterations
 
 
-def _descend(problem: Problem, placement: Placement, schedule: _Schedule) -> tuple[Solution, int]:
+def _descend(problem: Problem, placement: Placement, losses: tuple[Loss, ...]) -> tuple[Solution, int]:
     attached = detach(problem, placement.placed)
     adjustment = Adjustment(attached, attached.sightings)
     state, iterations, count = placement.state, 0, len(attached.sightings)
     few = _thinned(attached, adjustment)
-    for loss in schedule.losses:
+    for loss in losses:
         solution = few.solve(state, loss, iterations=12, tolerance=max(1.0, 1e-4 * count))
         state, iterations = solution.state, iterations + solution.iterations
     everywhere = np.ones(problem.stop_count, dtype=np.bool_)
     for k, loss in enumerate(_TAIL):
         if k == 0:
-            state, _ = retriangulate(attached, state, _ray_tolerance(attached), everywhere)
+            state, _ = retriangulate(attached, state, ray_tolerance(attached), everywhere)
         elif k == 1:
             doubtful = attached.sightings.label[_weights(adjustment, state) < _EXPLAINED]
-            state, _ = retriangulate(attached, state, _ray_tolerance(attached), everywhere, np.unique(doubtful))
+            state, _ = retriangulate(attached, state, ray_tolerance(attached), everywhere, np.unique(doubtful))
         last = k == len(_TAIL) - 1
         tolerance = max(1e-2, 1e-5 * count) if last else max(0.3, 1e-4 * count)
         solution = adjustment.solve(state, loss, iterations=25 if last else 12, tolerance=tolerance, damping=1e-6)
@@ -150,7 +157,7 @@ def _thinned(problem: Problem, adjustment: Adjustment) -> Adjustment:
     return Adjustment(problem, problem.sightings.select(problem.sightings.label % stride == 0))
 
 
-def _ray_tolerance(problem: Problem) -> float:
+def ray_tolerance(problem: Problem) -> float:
     """Four standard deviations of a sighting as an angle, and never less than what tilt and calibration leave."""
     if len(problem.sightings) == 0:
         return 0.015
@@ -400,7 +407,7 @@ def _hypotheses(problem: Problem, state: State, without: Bools | None = None) ->
         return gain, *none
     origin, direction = world_rays(fixed, rest, state)
     points, found = triangulate(
-        origin, direction, rest.label, rest.stop, rest.probability, count, _ray_tolerance(problem)
+        origin, direction, rest.label, rest.stop, rest.probability, count, ray_tolerance(problem)
     )
     rest = rest.select(found[rest.label])
     if len(rest) == 0:
