@@ -8,7 +8,9 @@ from setuptools import Extension, setup
 PACKAGES = [
     "robotd",
     "robotd.drivers",
+    "robotd.ctl",
     "robotd.geometry",
+    "robotd.operations",
     "robotd.roomba",
     "robotd.server",
     "robotd.sim",

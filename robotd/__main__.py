@@ -260,7 +260,9 @@ def check(path: Path) -> int:
 
 def run(path: Path, *, mission: bool) -> int:
     """Run the daemon until SIGTERM or SIGINT, or until its mission has ended."""
+    from .control_socket import ControlSocket
     from .daemon import Daemon, assemble
+    from .operations import Operations
     from .real import RealHardware
 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
@@ -270,7 +272,8 @@ def run(path: Path, *, mission: bool) -> int:
     daemon = Daemon(assembly)
 
     async def until_told() -> None:
-        work = asyncio.ensure_future(daemon.run(mission=mission))
+        control = ControlSocket(path.parent / assembly.config.robot.control, Operations(daemon))
+        work = asyncio.ensure_future(daemon.run(mission=mission, control=control))
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, work.cancel)
         await asyncio.gather(work, return_exceptions=True)

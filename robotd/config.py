@@ -34,6 +34,7 @@ class RobotConfig:
     state_directory: Path = Path("/var/lib/robotd")
     calibration: Path = Path("/var/lib/robotd/calibration.toml")
     guardian: Path = Path("/run/robotd-guardian/guardian.sock")
+    control: Path = Path("/run/robotd/control.sock")
     serial_log: Path | None = None
     serial_log_mb: float = ranged(64.0, minimum=1.0, maximum=100000.0)
 

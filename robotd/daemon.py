@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Coroutine, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
@@ -20,7 +20,8 @@ from .bus import Bus
 from .clock import in_thread, now, ticks
 from .config import Calibration, Config, collect, load_calibration, load_config, read_toml
 from .control import ControlLoop
-from .errors import ConfigError, DriverFault, UploadError
+from .control_socket import ControlSocket
+from .errors import ConfigError, InputError, MissionError, UploadError
 from .files import map_to_json
 from .hardware import CameraMode, Hardware, flicker_free
 from .journal import Journal
@@ -33,11 +34,11 @@ from .recording_upload import RecordingUploader
 from .records import Event, Map
 from .safety import SafetyGate
 from .serial_log import LoggedHardware, SerialLog
+from .supervisor import Supervisor
 from .upload import Uploader
 
 log = logging.getLogger("robotd")
 
-FIRST_RETRY_S, LAST_RETRY_S = 0.5, 30.0
 TRAIL_S = 0.1
 LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
@@ -218,38 +219,6 @@ def _plain(record: Any) -> dict[str, Any]:
     return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(record).items()}
 
 
-class Supervisor:
-    """Keeps one driver open: a DriverFault closes it, is reported, and it is opened again with growing back-off."""
-
-    def __init__(self, driver: Driver) -> None:
-        self.driver = driver
-        self.fault: str | None = f"{driver.name}: not opened yet"
-        self.restarts = 0
-
-    async def run(self) -> None:
-        """Until cancelled."""
-        delay = FIRST_RETRY_S
-        while True:
-            opened: float | None = None
-            try:
-                await self.driver.open()
-                self.fault = None
-                opened = now()
-                await self.driver.run()
-                raise DriverFault(f"{self.driver.name}: stopped by itself")
-            except DriverFault as fault:
-                text = str(fault).removeprefix(f"{self.driver.name}: ")
-                self.fault = f"{self.driver.name}: {text}"
-                self.driver.report(f"{text}; trying again in {delay:g} s", "error")
-            finally:
-                await self.driver.close()
-            if opened is not None and now() - opened > 10 * LAST_RETRY_S:
-                delay = FIRST_RETRY_S
-            await asyncio.sleep(delay)
-            delay = min(2 * delay, LAST_RETRY_S)
-            self.restarts += 1
-
-
 class Daemon:
     """One robot, running.
 
@@ -257,6 +226,10 @@ class Daemon:
     ----------
     map : Map or None
         After a mission: the server's map, completed with the labels that were never seen.
+    mission : Mission or None
+        The one that runs, or the last one.
+    journal : Journal
+    uploader : Uploader or None
     """
 
     def __init__(self, assembly: Assembly) -> None:
@@ -270,18 +243,26 @@ class Daemon:
         self.control = ControlLoop(bus, cast(Base, assembly.base), self.odometry, gate)
         self.supervisors = [Supervisor(driver) for driver in assembly.drivers]
         self.recordings = self._recordings()
+        self.uploader: Uploader | None = None
+        self._group: asyncio.TaskGroup
+        self._uploading: list[asyncio.Task[None]] = []
+        self._running: asyncio.Task[None] | None = None  # the operator's mission
 
-    async def run(self, *, mission: bool) -> None:
+    @property
+    def state(self) -> Path:
+        """The folder of all that the robot keeps."""
+        return self.assembly.path.parent / self.assembly.config.robot.state_directory
+
+    async def run(self, *, mission: bool, control: ControlSocket | None = None) -> None:
         """Until cancelled, or with `mission` until that one has ended and its stops are uploaded."""
-        assembly, config = self.assembly, self.assembly.config
-        state = assembly.path.parent / config.robot.state_directory
-        journal = await in_thread(Journal.open, state / "journal.sqlite")
+        assembly = self.assembly
+        self.journal = journal = await in_thread(Journal.open, self.state / "journal.sqlite")
         try:
             hardware = assembly.hardware
             synchronised = hardware.is_synchronised()
             await in_thread(journal.note_clock, hardware.boot_id(), now(), hardware.utc(), synchronised=synchronised)
-            uploader = self._uploader(journal)
-            async with asyncio.TaskGroup() as group:
+            uploader = self._uploader()
+            async with asyncio.TaskGroup() as self._group:
                 work = [
                     self._log_events(journal),
                     self._keep_trail(journal),
@@ -289,21 +270,76 @@ class Daemon:
                     self.recordings.run(),
                     *(supervisor.run() for supervisor in self.supervisors),
                 ]
-                if uploader is not None:
-                    work.append(uploader.run())
-                    if config.recording.upload:
-                        work.append(self._upload_recordings(uploader).run())
                 if assembly.serial_log is not None:
                     work.append(assembly.serial_log.follow(assembly.bus))
-                tasks = [group.create_task(item) for item in work]
+                if control is not None:
+                    work.append(self._listen(control))
+                tasks = [self._group.create_task(item) for item in work]
+                self._upload_by(uploader)
                 notify("READY=1\nSTATUS=ready")
                 if mission:
-                    await self._run_mission(journal, uploader, state)
-                    for task in tasks:
+                    await self._run_mission(await self._begin_mission())
+                    for task in (*tasks, *self._uploading):
                         task.cancel()
         finally:
             notify("STOPPING=1")
             await in_thread(journal.close)
+
+    async def _listen(self, control: ControlSocket) -> None:
+        try:
+            await control.run()
+        except InputError as error:  # the robot works without operators, too
+            self.assembly.bus.events.publish(Event(now(), "control", "error", str(error)))
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run something as long as the daemon runs."""
+        return self._group.create_task(work)
+
+    # ---- the operator's part -----------------------------------------------------------------------------------------
+
+    @property
+    def is_on_mission(self) -> bool:
+        """Whether a mission runs that an operator started; the robot is his otherwise."""
+        return self._running is not None and not self._running.done()
+
+    async def start_mission(self, *, survey: str | None = None, first_stop: int = 1) -> None:
+        """Begin a mission that an operator attends; a MissionError or InputError says why not."""
+        if self.is_on_mission:
+            raise MissionError("a mission is under way; robotctl mission abort ends it")
+        if (held := self.control.gate.latched) is not None and held.startswith("emergency stop"):
+            raise MissionError(f"the robot is held: {held}; robotctl release first")
+        self._running = self.spawn(asyncio.sleep(0))  # because a second start must not come in between
+        follower = next(item for item in self.supervisors if item.driver is self.assembly.follower)
+        follower.restart()  # because what it remembers is in the axes of the last leg
+        mission = await self._begin_mission(survey=survey, first_stop=first_stop, is_attended=True)
+        self.odometry.restart()
+        self._running = self.spawn(self._run_mission(mission))
+
+    def reconfigure(self, config: Config, drivers: Mapping[str, Driver]) -> None:
+        """Go on with another configuration, and with these drivers in place of those of the same names."""
+        old = self.assembly
+        self.assembly = replace(
+            old,
+            config=config,
+            labels=drivers.get(old.labels.name, old.labels),
+            beacons=drivers.get(old.beacons.name, old.beacons) if old.beacons is not None else None,
+        )
+        for supervisor in self.supervisors:
+            if supervisor.driver.name in drivers:
+                supervisor.restart(drivers[supervisor.driver.name])
+        self.control.gate.limits = config.safety
+        if config.upload != old.config.upload:
+            self._upload_by(self._uploader())
+
+    def _upload_by(self, uploader: Uploader | None) -> None:
+        for task in self._uploading:
+            task.cancel()
+        self.uploader = uploader
+        self._uploading = []
+        if uploader is not None:
+            self._uploading.append(self.spawn(uploader.run()))
+            if self.assembly.config.recording.upload:
+                self._uploading.append(self.spawn(self._upload_recordings(uploader).run()))
 
     def _recordings(self) -> Recordings:
         """The service that records cameras on request."""
@@ -331,7 +367,7 @@ class Daemon:
             is_busy=is_busy,
         )
 
-    def _uploader(self, journal: Journal) -> Uploader | None:
+    def _uploader(self) -> Uploader | None:
         upload = self.assembly.config.upload
         if upload.url is None:
             return None
@@ -348,7 +384,7 @@ class Daemon:
         def report(text: str, level: Any = "info") -> None:
             self.assembly.bus.events.publish(Event(now(), "upload", level, text))
 
-        return Uploader(journal, upload.url, token, upload.retry_s, upload.timeout_s, report)
+        return Uploader(self.journal, upload.url, token, upload.retry_s, upload.timeout_s, report)
 
     def _upload_recordings(self, uploader: Uploader) -> RecordingUploader:
         """Sends finished recordings to where the stops go."""
@@ -364,7 +400,9 @@ class Daemon:
         self.recordings.finished = recordings.wake
         return recordings
 
-    async def _run_mission(self, journal: Journal, uploader: Uploader | None, state: Path) -> None:
+    async def _begin_mission(
+        self, *, survey: str | None = None, first_stop: int = 1, is_attended: bool = False
+    ) -> Mission:
         assembly, config = self.assembly, self.assembly.config
         identify = replace(
             config.mission.identify,
@@ -372,8 +410,8 @@ class Daemon:
             row_time_s=assembly.calibration.row_time_s,
             exposure_s=flicker_free(config.mission.identify.exposure_s, config.mission.mains_hz),
         )
-        self.mission = mission = Mission(
-            replace(config.mission, identify=identify),
+        mission = Mission(
+            replace(config.mission, identify=identify, survey=survey or config.mission.survey),
             assembly.calibration,
             bus=assembly.bus,
             hardware=assembly.hardware,
@@ -383,24 +421,36 @@ class Daemon:
             cameras={name: cast(Camera, driver) for name, driver in assembly.cameras.items()},
             eye=cast(Camera, assembly.eye),
             odometry=self.odometry,
-            journal=journal,
+            journal=self.journal,
             health=Health(self._fault, lambda: self.control.cause),
-            wake_upload=uploader.wake if uploader is not None else lambda: None,
+            wake_upload=self._wake_upload,
+            first_stop=first_stop,
+            is_attended=is_attended,
         )
+        await mission.begin()
+        self.mission = mission
+        return mission
+
+    def _wake_upload(self) -> None:
+        if self.uploader is not None:
+            self.uploader.wake()
+
+    async def _run_mission(self, mission: Mission) -> None:
+        assembly, uploader = self.assembly, self.uploader
         self.control.resume("the mission's start")
         await mission.run()
         if uploader is not None:
-            await self._fetch_map(mission, uploader, state)
+            await self._fetch_map(mission, uploader)
         status = assembly.bus.status.latest
         if status is not None:
             assembly.bus.status.publish(replace(status, t=now(), state="done"))
 
-    async def _fetch_map(self, mission: Mission, uploader: Uploader, state: Path) -> None:
+    async def _fetch_map(self, mission: Mission, uploader: Uploader) -> None:
         config = self.assembly.config
         try:
             async with asyncio.timeout(config.mission.upload_wait_s):
                 await uploader.wait_empty()
-            solved = await uploader.fetch_map(config.mission.survey)
+            solved = await uploader.fetch_map(mission.config.survey)
         except (TimeoutError, UploadError) as error:
             text = str(error) or f"the server did not take every stop within {config.mission.upload_wait_s:g} s"
             self.assembly.bus.events.publish(
@@ -408,7 +458,7 @@ class Daemon:
             )
             return
         self.map = complete_map(solved, config.mission.labels, len(mission.stops), mission.ended)
-        await in_thread(_write, state / "map.json", map_to_json(self.map))
+        await in_thread(_write, self.state / "map.json", map_to_json(self.map))
 
     def _fault(self) -> str | None:
         return next((supervisor.fault for supervisor in self.supervisors if supervisor.fault is not None), None)

@@ -10,24 +10,33 @@ Times are loop times (`t`); with the row of `clock` that was newest when they we
 
 from __future__ import annotations
 
-import hashlib
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
 
 import msgspec
-import numpy as np
 
 from .errors import InputError, MissionError
+from .journal_records import (
+    LoggedEvent,
+    StopSummary,
+    SurveySummary,
+    Upload,
+    date_after,
+    digest,
+    header_body,
+    name_problem,
+    read_header,
+    stop_body,
+)
 from .records import Event, Stop, Survey
 
 APPLICATION_ID = 0x726F626F  # "robo": tells our files from other SQLite files
-VERSION = 1
+VERSION = 2
 SCHEMA = f"""
 BEGIN IMMEDIATE;
 CREATE TABLE clock (id INTEGER PRIMARY KEY, boot TEXT NOT NULL, t REAL NOT NULL, utc TEXT NOT NULL,
@@ -38,7 +47,7 @@ CREATE TABLE legs (id INTEGER PRIMARY KEY, survey INTEGER NOT NULL REFERENCES su
     clock INTEGER REFERENCES clock);
 CREATE TABLE stops (id INTEGER PRIMARY KEY, survey INTEGER NOT NULL REFERENCES surveys, leg INTEGER NOT NULL,
     stop INTEGER NOT NULL, body BLOB NOT NULL, digest TEXT NOT NULL, acknowledged INTEGER NOT NULL DEFAULT 0,
-    UNIQUE (survey, leg, stop));
+    replaces TEXT, rejected TEXT, original BLOB, UNIQUE (survey, leg, stop));
 CREATE TABLE slots (id INTEGER PRIMARY KEY, leg INTEGER NOT NULL REFERENCES legs, stop INTEGER NOT NULL,
     slot INTEGER NOT NULL, started REAL NOT NULL, ended REAL NOT NULL, clock INTEGER REFERENCES clock);
 CREATE TABLE events (id INTEGER PRIMARY KEY, t REAL NOT NULL, source TEXT NOT NULL, level TEXT NOT NULL,
@@ -50,20 +59,14 @@ PRAGMA user_version = {VERSION};
 COMMIT;
 """
 
-
-@dataclass(frozen=True, slots=True)
-class Upload:
-    """One record as the server gets it: `body` is JSON, `digest` its SHA-256 in hexadecimal.
-
-    `leg` and `stop` are 0 for a survey's header.
-    """
-
-    kind: Literal["header", "stop"]
-    survey: str
-    leg: int
-    stop: int
-    body: bytes
-    digest: str
+FROM_1 = """
+BEGIN IMMEDIATE;
+ALTER TABLE stops ADD COLUMN replaces TEXT;
+ALTER TABLE stops ADD COLUMN rejected TEXT;
+ALTER TABLE stops ADD COLUMN original BLOB;
+PRAGMA user_version = 2;
+COMMIT;
+"""
 
 
 class Journal:
@@ -157,7 +160,7 @@ class Journal:
                 (last,) = self._sure.execute(
                     "SELECT coalesce(max(leg), 0) FROM stops WHERE survey = ?", (survey,)
                 ).fetchone()
-                self._renew_header(survey, _header(row[1]), header, has_stops=last > 0)
+                self._renew_header(survey, read_header(row[1]), header, has_stops=last > 0)
             self._leg = self._sure.execute(
                 "INSERT INTO legs (survey, leg, clock) VALUES (?, ?, ?)", (survey, last + 1, self._clock)
             ).lastrowid
@@ -220,22 +223,102 @@ class Journal:
     def survey(self, name: str) -> Survey:
         """A whole survey as the journal has it; raises InputError naming those it has."""
         with self._lock:
-            row = self._sure.execute("SELECT id, body FROM surveys WHERE name = ?", (name,)).fetchone()
+            row = self._sure.execute("SELECT id, body FROM surveys WHERE id = ?", (self.survey_id(name),)).fetchone()
+            bodies = self._sure.execute("SELECT body FROM stops WHERE survey = ? ORDER BY leg, stop", (row[0],))
+            stops = tuple(msgspec.json.decode(body, type=Stop) for (body,) in bodies)
+        return replace(read_header(row[1]), stops=stops)
+
+    def survey_id(self, name: str) -> int:
+        """The row of a survey; raises InputError naming those there are."""
+        with self._lock:
+            row = self._sure.execute("SELECT id FROM surveys WHERE name = ?", (name,)).fetchone()
             if row is None:
                 known = [other for (other,) in self._sure.execute("SELECT name FROM surveys ORDER BY id")]
                 raise InputError(f"{self.path}: no survey {name!r}; there is {', '.join(known) or 'none'}")
-            bodies = self._sure.execute("SELECT body FROM stops WHERE survey = ? ORDER BY leg, stop", (row[0],))
-            stops = tuple(msgspec.json.decode(body, type=Stop) for (body,) in bodies)
-        return replace(_header(row[1]), stops=stops)
+        return int(row[0])
+
+    def surveys(self) -> dict[str, SurveySummary]:
+        """Every survey, oldest first."""
+        with self._lock:
+            rows = self._sure.execute(
+                "SELECT name, surveys.body, count(DISTINCT leg), count(stops.id), count(rejected), "
+                "(NOT surveys.acknowledged) + coalesce(sum(NOT stops.acknowledged), 0) "
+                "FROM surveys LEFT JOIN stops ON stops.survey = surveys.id GROUP BY surveys.id ORDER BY surveys.id"
+            ).fetchall()
+        return {name: SurveySummary(read_header(body).created, *counts) for name, body, *counts in rows}
+
+    def stops(self, survey: str) -> list[StopSummary]:
+        """Every stop of a survey, by leg and number; raises InputError naming the surveys there are."""
+        self.survey_id(survey)
+        with self._lock:
+            rows = self._sure.execute(
+                "SELECT stops.body, stops.acknowledged, rejected FROM stops JOIN surveys ON surveys.id = stops.survey "
+                "WHERE name = ? ORDER BY leg, stop",
+                (survey,),
+            ).fetchall()
+        return [StopSummary(msgspec.json.decode(body, type=Stop), bool(sent), why) for body, sent, why in rows]
+
+    def reject(self, survey: str, leg: int, stop: int, reason: str) -> None:
+        """Leave a stop's sightings out of the survey; where the robot stood stays, for the stops around it.
+
+        Raises
+        ------
+        InputError
+            If there is no such stop, or it is rejected already.
+        MissionError
+            If the disk does not take it.
+        """
+        body, rejected, _ = self._stop_row(survey, leg, stop)
+        if rejected is not None:
+            raise InputError(f"survey {survey!r}: leg {leg} stop {stop} is rejected already: {rejected}")
+        bare = replace(msgspec.json.decode(body, type=Stop), sightings=(), beacon_sightings=())
+        self._replace_stop(survey, leg, stop, stop_body(bare), body, reason)
+
+    def restore(self, survey: str, leg: int, stop: int) -> None:
+        """Take a rejection back; raises as `reject`."""
+        _, rejected, original = self._stop_row(survey, leg, stop)
+        if rejected is None or original is None:
+            raise InputError(f"survey {survey!r}: leg {leg} stop {stop} is not rejected")
+        self._replace_stop(survey, leg, stop, original, None, None)
+
+    def _stop_row(self, survey: str, leg: int, stop: int) -> tuple[bytes, str | None, bytes | None]:
+        with self._lock:
+            row = self._sure.execute(
+                "SELECT body, rejected, original FROM stops WHERE survey = ? AND leg = ? AND stop = ?",
+                (self.survey_id(survey), leg, stop),
+            ).fetchone()
+        if row is None:
+            raise InputError(f"survey {survey!r}: there is no leg {leg} stop {stop}")
+        return row[0], row[1], row[2]
+
+    def _replace_stop(
+        self, survey: str, leg: int, stop: int, body: bytes, original: bytes | None, reason: str | None
+    ) -> None:
+        """Another content for a stop, to be uploaded in place of what the server has or will have got by then."""
+        with self._transaction():
+            self._sure.execute(
+                "UPDATE stops SET replaces = digest, acknowledged = 0, body = ?, digest = ?, original = ?, "
+                "rejected = ? WHERE survey = ? AND leg = ? AND stop = ?",
+                (body, digest(body), original, reason, self.survey_id(survey), leg, stop),
+            )
 
     # ---- upload queue ------------------------------------------------------------------------------------------------
+
+    def waiting(self) -> int:
+        """How many records the server has not acknowledged."""
+        with self._lock:
+            (count,) = self._sure.execute(
+                "SELECT (SELECT count(*) FROM surveys WHERE NOT acknowledged) "
+                "+ (SELECT count(*) FROM stops WHERE NOT acknowledged)"
+            ).fetchone()
+        return int(count)
 
     def pending(self) -> list[Upload]:
         """What the server has not acknowledged, oldest first, each header before its stops."""
         with self._lock:
             rows = self._sure.execute(
-                "SELECT id, 0, 'header', name, 0, 0, body, digest FROM surveys WHERE NOT acknowledged UNION ALL "
-                "SELECT surveys.id, stops.id, 'stop', name, leg, stop, stops.body, stops.digest "
+                "SELECT id, 0, 'header', name, 0, 0, body, digest, NULL FROM surveys WHERE NOT acknowledged UNION ALL "
+                "SELECT surveys.id, stops.id, 'stop', name, leg, stop, stops.body, stops.digest, replaces "
                 "FROM stops JOIN surveys ON surveys.id = stops.survey WHERE NOT stops.acknowledged ORDER BY 1, 2"
             ).fetchall()
         return [Upload(*row[2:]) for row in rows]
@@ -287,6 +370,31 @@ class Journal:
             [(event.t, event.source, event.level, event.text, self._clock)],
         )
 
+    def events(self, count: int, *, level: str = "info", after: int = 0) -> list[LoggedEvent]:
+        """The newest events of at least this level, oldest first; `after`: only those with a greater number."""
+        levels = ("info", "warning", "error")
+        wanted = levels[levels.index(level) :]
+        with self._lock:
+            rows = self._quick.execute(
+                "SELECT events.id, clock.utc, events.t - clock.t, synchronised, source, level, text FROM events "
+                "LEFT JOIN clock ON clock.id = events.clock WHERE events.id > ? "
+                f"AND level IN ({', '.join('?' * len(wanted))}) ORDER BY events.id DESC LIMIT ?",
+                (after, *wanted, count),
+            ).fetchall()
+        return [
+            LoggedEvent(number, date_after(utc, since), bool(sure), source, level, text)
+            for number, utc, since, sure, source, level, text in reversed(rows)
+        ]
+
+    def trail(self, count: int) -> list[tuple[float, float, float, float]]:
+        """Where the robot drove in the current leg: its newest rows of loop time, x, y, heading, oldest first."""
+        with self._lock:
+            rows = self._quick.execute(
+                "SELECT t, x, y, heading FROM trail WHERE leg IS ? AND clock IS ? ORDER BY id DESC LIMIT ?",
+                (self._leg, self._clock, count),
+            ).fetchall()
+        return rows[::-1]
+
     def add_trail(self, rows: Sequence[tuple[float, float, float, float]]) -> None:
         """Keep where the robot drove in the current leg: rows of loop time, x, y, heading."""
         self._note(
@@ -325,57 +433,6 @@ class Journal:
                 raise
 
 
-def header_body(header: Survey) -> bytes:
-    """A survey's header as it is sent: the JSON of `robotd-survey/1` without `stops`."""
-    data = msgspec.to_builtins(header, enc_hook=_plain)
-    del data["stops"]
-    body = msgspec.json.encode(data)
-    _check_body(body, _header, replace(header, stops=()), f"header of survey {header.survey!r}")
-    return body
-
-
-def stop_body(stop: Stop) -> bytes:
-    """A stop as it is sent: one entry of `stops` in `robotd-survey/1`; raises ValueError if it does not read back."""
-    body = msgspec.json.encode(stop, enc_hook=_plain)
-    _check_body(body, lambda data: msgspec.json.decode(data, type=Stop), stop, f"leg {stop.leg} stop {stop.stop}")
-    return body
-
-
-def digest(body: bytes) -> str:
-    """SHA-256 in hexadecimal."""
-    return hashlib.sha256(body).hexdigest()
-
-
-def name_problem(name: str) -> str | None:
-    """Why a survey cannot have this name, or None: it must survive in an address and fit a file name."""
-    if not 1 <= len(name.encode(errors="replace")) <= 60:
-        return "a name has 1 to 60 bytes"
-    if name.strip(".") == "" or any(not char.isprintable() or char in "/\\" for char in name):
-        return "a name has printable characters, no slashes, and not only dots"
-    return None
-
-
-def _plain(value: object) -> object:
-    """Numpy's numbers as Python's."""
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{type(value).__name__} cannot be stored")
-
-
-def _header(body: bytes) -> Survey:
-    return msgspec.json.decode(body[:-1] + b',"stops":[]}', type=Survey)
-
-
-def _check_body(body: bytes, read: object, record: object, what: str) -> None:
-    """Refuse what JSON cannot carry (NaN becomes null), while the caller can still be found."""
-    try:
-        same = read(body) == record  # type: ignore[operator]
-    except msgspec.ValidationError as error:
-        raise ValueError(f"{what}: {error}; a number in it is not finite or of the wrong type") from error
-    if not same:
-        raise ValueError(f"{what}: does not read back as it was written")
-
-
 def _check(connection: sqlite3.Connection, path: Path) -> None:
     """Make sure that this is a sound journal of a version we know, creating the tables in an empty file."""
     (application,) = connection.execute("PRAGMA application_id").fetchone()
@@ -383,6 +440,9 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
     (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
     if tables and application != APPLICATION_ID:
         raise InputError(f"{path}: an SQLite file of another program, not a journal; name another file")
+    if tables and version == 1:
+        connection.executescript(FROM_1)
+        version = 2
     if tables and version != VERSION:
         raise InputError(f"{path}: a journal of version {version}; this robotd knows version {VERSION}: update robotd")
     (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()

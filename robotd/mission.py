@@ -1,8 +1,10 @@
 """The mission: drive the line, stop, have the labels flash, record what the cameras saw, go on.
 
     idle -> driving -> settling -> observing -> driving -> ... -> uploading -> done
-      any of them -> paused (a device failed; goes on when it works again) -> the state before
-      any of them -> fault (line lost, bumper, emergency stop, a device stays dead) -> uploading -> done
+      any of them -> paused (a device failed, or an operator's wish; the step is repeated) -> the state before
+      any of them -> fault (line lost, bumper, emergency stop, a device stays dead, aborted) -> uploading -> done
+
+An operator who started the mission is there to help: then what would end it pauses it, until `resume` or `abort`.
 
 Every finished stop is in the journal before the robot moves on. A mission that ends early keeps and uploads the
 stops it made, and the map says of each label without a position why it has none.
@@ -51,6 +53,14 @@ class Health:
         self.hazard = hazard
 
 
+class _Paused(Exception):
+    """An operator wants the mission to stand still."""
+
+
+class _Aborted(MissionError):
+    """An operator has ended the mission."""
+
+
 class Mission:
     """One run along the line.
 
@@ -64,6 +74,10 @@ class Mission:
         Dead reckoning since the start of the leg, kept up to date by the control loop.
     wake_upload
         Called after each record that waits to be uploaded.
+    first_stop : int
+        The stop at which the robot stands at the start; those before it are left out.
+    is_attended : bool
+        An operator is there, who can mend what would end the mission: it pauses instead.
     """
 
     def __init__(
@@ -82,6 +96,8 @@ class Mission:
         journal: Journal,
         health: Health,
         wake_upload: Callable[[], None],
+        first_stop: int = 1,
+        is_attended: bool = False,
     ) -> None:
         self.config = config
         self.calibration = calibration
@@ -99,11 +115,19 @@ class Mission:
         self.leg = 1
         self.stops: list[Stop] = []
         self.ended: str | None = None  # why the mission ended early, in words
+        self.is_over = False  # no step will follow
+        self.first_stop = first_stop
+        self.is_attended = is_attended
+        self.paused: str | None = None  # by an operator, or by what an operator has to mend: why
+        self._aborted: str | None = None
+        self._number = first_stop  # of the stop at hand
+        self._by_hand = 0.0  # metres that were not driven along the line
+        self._was_lifted = False  # since the last stop
         self._workers: ThreadPoolExecutor | None = None
         self._groups = config.camera_groups or (tuple(cameras),)
 
-    async def run(self) -> None:
-        """Make every stop that can be made; afterwards `stops` and `ended` say what came of it."""
+    async def begin(self) -> None:
+        """Begin the leg in the journal; raises InputError if the survey cannot have another one."""
         config = self.config
         self._header = Survey(
             survey=config.survey,
@@ -116,10 +140,13 @@ class Mission:
         )
         self.leg = await in_thread(self.journal.begin_leg, self._header)
         self.wake_upload()
+
+    async def run(self) -> None:
+        """Make every stop that can be made; afterwards `stops` and `ended` say what came of it. After `begin`."""
         with ThreadPoolExecutor(max_workers=max(1, len(self.cameras)), thread_name_prefix="blink") as self._workers:
             try:
                 await self._ready()
-                for number in range(1, self._most_stops + 1):
+                for number in range(self.first_stop, self._most_stops + 1):
                     if await self._through_faults("driving", number, partial(self._drive, number)) == "end":
                         text = f"the line ended after stop {number - 1}: all its markers are made"
                         self.bus.events.publish(Event(now(), "mission", "info", text))
@@ -131,17 +158,37 @@ class Mission:
             except MissionError as error:
                 self.ended = str(error)
                 self._halt(self.ended)
-                self._status("fault", len(self.stops) + 1, self.ended)
+                self._status("fault", self._number, self.ended)
                 self.bus.events.publish(Event(now(), "mission", "error", self.ended))
-        self._status("uploading", len(self.stops))
+            finally:
+                self.is_over = True
+        self._status("uploading", self._number)
+
+    # ---- an operator's wishes ----------------------------------------------------------------------------------------
+
+    def pause(self, cause: str) -> None:
+        """Halt now and stand still until `resume`, whatever it is doing; that step is repeated then."""
+        if self.paused is None:
+            self.paused = cause
+        self._halt(cause)
+
+    def resume(self) -> None:
+        """Go on."""
+        self.paused = None
+
+    def abort(self, cause: str) -> None:
+        """Halt now and end; the stops that were made stay."""
+        self._aborted = cause
+        self._halt(cause)
 
     # ---- the steps ---------------------------------------------------------------------------------------------------
 
     async def _ready(self) -> None:
         """Wait until every driver is open for the first time and the base talks."""
-        self._status("idle", 1)
+        self._status("idle", self.first_stop)
         deadline = now() + FAULT_WAIT_S
         while (fault := self.health.fault()) is not None or self.bus.odometry.latest is None:
+            self._heed_abort()
             if now() > deadline:
                 raise MissionError(fault or f"{self.base.name}: no sensor frame for {FAULT_WAIT_S:g} s")
             await asyncio.sleep(0.05)
@@ -151,9 +198,10 @@ class Mission:
         config, state = self.config, self.bus.odometry.latest
         at_marker = config.stop_at == "markers"
         if at_marker:
-            target = math.inf if number > 1 else 0.0
+            target = math.inf if number > self.first_stop else 0.0
         else:
-            target = config.stops[number - 1] - config.stops[0]
+            target = config.stops[number - 1] - config.stops[self.first_stop - 1]
+        target += self._by_hand
         if state is not None and state.travelled >= target - 0.001:
             return None
         await self.eye.start(self.follower.mode)
@@ -210,23 +258,22 @@ class Mission:
         identifier.begin(slot, started)
         for request in slot.requests:
             await self.labels.flash(request.labels, self.config.identify.strength, request.duration)
-        self._status("observing", len(self.stops) + 1, f"slot {slot.number + 1}")
+        self._status("observing", self._number, f"slot {slot.number + 1}")
         while now() < started + slot.timeout and not identifier.is_complete(now()):
             await asyncio.sleep(0.1)
-        await in_thread(
-            self.journal.add_slot, self.config.survey, self.leg, len(self.stops) + 1, slot.number, started, now()
-        )
+        await in_thread(self.journal.add_slot, self.config.survey, self.leg, self._number, slot.number, started, now())
 
     async def _record(self, number: int, sightings: Sequence[Sighting]) -> None:
         state = self.bus.odometry.latest
         move = None
-        if self.stops and self.odometry.broken_since_mark:
+        if self.stops and (self.odometry.broken_since_mark or self._was_lifted):
             self.leg = await in_thread(self.journal.begin_leg, self._header)
             text = f"odometry was interrupted before stop {number}: leg {self.leg} begins there"
             self.bus.events.publish(Event(now(), "mission", "warning", text))
         elif self.stops:
             move = self.odometry.move_since_mark()
         self.odometry.mark()
+        self._was_lifted = False
         stop = Stop(
             leg=self.leg,
             stop=number,
@@ -248,16 +295,25 @@ class Mission:
         """Run a step; when a device fails wait for it to work again and repeat the step.
 
         Raises MissionError when the step cannot be done: line lost, wheels stopped by the safety layer, or a device
-        that stays dead for FAULT_WAIT_S.
+        that stays dead for FAULT_WAIT_S. If an operator attends, that is for the operator to mend.
         """
+        self._number = stop
         while True:
             self._status(state, stop)
             try:
-                return await _first(step(), self._trouble(driving=state == "driving"))
-            except DriverFault as fault:
-                self._halt(str(fault))
-                self._status("paused", stop, str(fault))
-                await self._wait_healthy(str(fault))
+                try:
+                    return await _first(step(), self._trouble(driving=state == "driving"))
+                except DriverFault as fault:
+                    self._halt(str(fault))
+                    self._status("paused", stop, str(fault))
+                    await self._wait_healthy(str(fault))
+            except _Paused as paused:
+                await self._wait_resumed(stop, str(paused))
+            except MissionError as error:
+                if not self.is_attended or isinstance(error, _Aborted):
+                    raise
+                self.pause(str(error))
+                await self._wait_resumed(stop, str(error))
 
     def _halt(self, cause: str) -> None:
         """Zero velocity at once, and the follower's wish to move no longer counts."""
@@ -265,10 +321,16 @@ class Mission:
         self.bus.withdrawals.publish(Withdrawal(now(), self.follower.name, cause))
 
     async def _trouble(self, *, driving: bool) -> Any:
-        """Never returns; raises DriverFault when a device fails, MissionError when the wheels are held for HELD_S."""
+        """Never returns; raises DriverFault when a device fails, MissionError when the wheels are held for HELD_S,
+        and what an operator wants.
+        """
         since: float | None = None
         while True:
+            self._heed_abort()
+            if self.paused is not None:
+                raise _Paused(self.paused)
             await asyncio.sleep(0.05)
+            self._note_lift()
             if (fault := self.health.fault()) is not None:
                 raise DriverFault(fault)
             hazard = self.health.hazard()
@@ -276,10 +338,35 @@ class Mission:
             if driving and since is not None and now() - since >= HELD_S:
                 raise MissionError(f"halted: {hazard}")
 
+    async def _wait_resumed(self, stop: int, cause: str) -> None:
+        """Stand still until an operator resumes; what is driven by hand meanwhile is no way along the line."""
+        self._halt(cause)
+        self._status("paused", stop, cause)
+        self.bus.events.publish(Event(now(), "mission", "warning", f"paused: {cause}"))
+        state = self.bus.odometry.latest
+        before = 0.0 if state is None else state.travelled
+        while self.paused is not None:
+            self._heed_abort()
+            self._note_lift()
+            await asyncio.sleep(0.05)
+        state = self.bus.odometry.latest
+        self._by_hand += (0.0 if state is None else state.travelled) - before
+        self.bus.events.publish(Event(now(), "mission", "info", "goes on"))
+
+    def _note_lift(self) -> None:
+        """A lifted robot is put down somewhere else, which no wheel tells: the leg ends."""
+        frame = self.bus.sensors.latest
+        self._was_lifted |= frame is not None and (frame.wheel_drop_left or frame.wheel_drop_right)
+
+    def _heed_abort(self) -> None:
+        if self._aborted is not None:
+            raise _Aborted(self._aborted)
+
     async def _wait_healthy(self, fault: str) -> None:
         deadline = now() + FAULT_WAIT_S
         await asyncio.sleep(0.5)
         while self.health.fault() is not None:
+            self._heed_abort()
             if now() > deadline:
                 raise MissionError(f"{fault}; it did not come back within {FAULT_WAIT_S:g} s")
             await asyncio.sleep(0.2)

@@ -151,6 +151,13 @@ class Odometry:
         self._last: tuple[float, float, float] | None = None
         self._recent: deque[tuple[float, float, float]] = deque()
 
+    def restart(self) -> None:
+        """Begin anew: the robot stands at (0, 0, 0), and has not been driven."""
+        self._pose = Pose(0.0, 0.0, 0.0)
+        self._travelled = 0.0
+        self._whole = _Path(self.wheels, noise=False)
+        self.mark()
+
     @property
     def broken_since_mark(self) -> bool:
         """Whether a reset happened since the mark: then the move lacks an unknown motion, and the leg ends here."""

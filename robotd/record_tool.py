@@ -18,11 +18,12 @@ from typing import Any, cast
 from .bus import Bus
 from .clock import in_thread, now
 from .config import Calibration, Config, load_calibration
-from .daemon import Plan, Supervisor, read_config
+from .daemon import Plan, read_config
 from .errors import DriverFault, InputError
 from .hardware import CameraMode, Hardware, flicker_free
 from .plugin import Camera, Driver
 from .recorder import Progress, describe_camera, describe_recording, record
+from .supervisor import Supervisor
 
 OPEN_S = 10.0  # for a camera to show its first frame
 

@@ -21,7 +21,8 @@ import yarl
 from .clock import in_thread, now, outside
 from .errors import InputError, UploadError
 from .files import map_from_json
-from .journal import Journal, Upload
+from .journal import Journal
+from .journal_records import Upload
 from .records import Map
 
 LONGEST = 64  # times retry_s: the longest pause, and the pause between offers of a refused record
@@ -72,6 +73,11 @@ class Uploader:
         self._factor = 1
         self._trouble: str | None = None
         self._refused: dict[str, float] = {}  # digest -> loop time from which on to offer it again
+
+    @property
+    def trouble(self) -> str | None:
+        """Why nothing can be sent now, in words."""
+        return self._trouble
 
     def wake(self) -> None:
         """Say that new records wait in the journal."""
@@ -164,6 +170,8 @@ class Uploader:
             address += f"/legs/{upload.leg}/stops/{upload.stop}"
         hashed = base64.b64encode(bytes.fromhex(upload.digest)).decode()
         headers = {"Content-Type": "application/json", "Content-Digest": f"sha-256=:{hashed}:"}  # RFC 9530
+        if upload.replaces is not None:
+            headers["If-Match"] = f'"{upload.replaces}"'  # RFC 9110, section 13.1.1
         try:
             answer = await self._exchange(session, "PUT", address, body=upload.body, headers=headers)
         except _MissingError as error:

@@ -13,12 +13,12 @@ from robotd.bus import Bus
 from robotd.clock import now, run_virtual, stall, ticks
 from robotd.config import Calibration
 from robotd.control import ControlLoop
-from robotd.daemon import Supervisor
 from robotd.odometry import Odometry, Wheels
 from robotd.records import OPERATOR, DriveCommand, Withdrawal
 from robotd.safety import SafetyGate, SafetyLimits
 from robotd.sim.roomba import SimRoomba
 from robotd.sim.roomba_link import RoombaLink
+from robotd.supervisor import Supervisor
 
 PORT = "/dev/robotd/base"
 REACTION = 0.100  # s from the last byte that carries the hazard to the first byte of zero speed

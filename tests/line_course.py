@@ -16,7 +16,6 @@ from robotd.drivers.v4l2 import V4l2Config, V4l2Driver
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
 from robotd.control import ControlLoop
-from robotd.daemon import Supervisor
 from robotd.errors import MissionError
 from robotd.odometry import Odometry
 from robotd.safety import SafetyGate, SafetyLimits
@@ -25,6 +24,7 @@ from robotd.sim.layout import Floor, Lamp, LineLayout, StoreLayout
 from robotd.sim.referee import Referee
 from robotd.sim.settings import WorldSettings
 from robotd.sim.world import World
+from robotd.supervisor import Supervisor
 
 LONGEST_S = 90.0  # for one drive, in virtual time
 TEXTURES = ("carpet", "wood", "concrete", "tiles", "asphalt")

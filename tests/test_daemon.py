@@ -17,11 +17,12 @@ from robotd.bind import bind
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
 from robotd.config import Calibration, Config, save_calibration
-from robotd.daemon import Supervisor, assemble, read_config
+from robotd.daemon import assemble, read_config
 from robotd.errors import ConfigError, DriverFault
 from robotd.mission import complete_map
 from robotd.plugin import Driver, available
 from robotd.records import CameraModel, Map, MappedLabel, SolverRun, Transform
+from robotd.supervisor import Supervisor
 
 EXAMPLE = Path(__file__).parent.parent / "etc" / "robotd.toml"
 

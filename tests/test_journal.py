@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from robotd.errors import InputError, MissionError
 from robotd.files import header_from_json, stop_from_json
-from robotd.journal import Journal, digest, header_body, name_problem, stop_body
+from robotd.journal import Journal
+from robotd.journal_records import digest, header_body, name_problem, stop_body
 from robotd.records import CameraModel, Event, Move, Pose, Rig, Sighting, Stop, Survey, Transform
 
 CAMERA = CameraModel(
@@ -264,9 +265,9 @@ def test_files_that_are_no_journal_are_left_alone(tmp_path):
 def test_a_journal_of_a_newer_version_is_refused(tmp_path):
     Journal.open(tmp_path / "j").close()
     with sqlite3.connect(tmp_path / "j") as connection:
-        connection.execute("PRAGMA user_version = 2")
+        connection.execute("PRAGMA user_version = 3")
     connection.close()
-    with pytest.raises(InputError, match="a journal of version 2; this robotd knows version 1: update robotd"):
+    with pytest.raises(InputError, match="a journal of version 3; this robotd knows version 2: update robotd"):
         Journal.open(tmp_path / "j")
 
 

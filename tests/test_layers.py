@@ -25,6 +25,7 @@ LAYERS = {
         "wheel_calibration",
         "toml_edit",
         *("typed_json", "_json_keys"),
+        "rpc",
         *("follow", "drive_path", "lost_line"),
         "identify",
         "safety",
@@ -35,16 +36,17 @@ LAYERS = {
     2: [
         *("clock", "link", "real", "config", "files", "bus", "hardware", "journal", "upload", "telemetry", "recording"),
         "recording_upload",
+        "journal_records",
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
     ],
     3: ["plugin", "camera_driver"],
     4: ["drivers"],
-    5: ["mission", "control", "wheel_runs", "recorder", "daemon"],
+    5: ["mission", "control", "wheel_runs", "recorder", "supervisor", "control_socket", "daemon", "operations"],
     6: ["sim", "server"],
     7: ["__main__", "demo", "line_tool", "floor_tool", "record_tool", "calibrate", "doctor", "solver_main"],
 }
-APART = {"cli": {"errors"}, "client": {"errors"}, "gateway": {"errors"}}
+APART = {"ctl": {"ctl", "errors"}, "gateway": {"errors"}}
 APART |= {"guardian": {"errors", "serial_port"}, "serial_port": {"errors"}}  # and pyserial: the guardian's process
 LAYER = {name: layer for layer, names in LAYERS.items() for name in names}
 MAY = {

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from robotd import oi
 from robotd.clock import now, run_virtual
-from robotd.daemon import Supervisor
 from robotd.errors import DriverFault
 from robotd.odometry import Odometry, Wheels
 from robotd.sim.quirks import LineFaults, RoombaQuirks
+from robotd.supervisor import Supervisor
 from tests.roomba_bench import Bench, bench_test
 
 

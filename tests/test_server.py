@@ -25,7 +25,7 @@ import uvicorn
 
 from robotd.errors import InputError, SolverError
 from robotd.files import map_from_json, map_to_json, survey_from_json, survey_to_json
-from robotd.journal import header_body, stop_body
+from robotd.journal_records import header_body, stop_body
 from robotd.records import CameraModel, Map, Move, Pose, Rig, Sighting, SolverRun, Stop, Survey, Transform
 from robotd.server import jobs
 from robotd.server.app import create_app, serve

@@ -19,7 +19,8 @@ import pytest
 from robotd.clock import now, run_virtual
 from robotd.errors import InputError, UploadError
 from robotd.files import map_to_json
-from robotd.journal import Journal, digest
+from robotd.journal import Journal
+from robotd.journal_records import digest
 from robotd.records import CameraModel, Map, Pose, Rig, SolverRun, Stop, Survey, Transform
 from robotd.server.store import Store
 from robotd.upload import Uploader

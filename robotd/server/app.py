@@ -11,7 +11,8 @@
     GET /healthz                                      no token needed
 
 Every refusal is JSON, {"problems": ["...", ...]}. A PUT may carry the SHA-256 of its body (RFC 9530); it is answered
-with the SHA-256 of what is on the disk, 201 if that is new and 200 if it was there.
+with the SHA-256 of what is on the disk, 201 if that is new and 200 if it was there. A stop with `If-Match: "SHA-256"`
+replaces the content of that hash: so a robot takes back the sightings of a stop that its operator has rejected.
 
 A piece of a recording carries `Content-Range: bytes FIRST-LAST/SIZE` (RFC 9110) and the SHA-256 of the whole as
 `Repr-Digest` (RFC 9530). It is answered as the GET is, 201 if that completed the recording; 409 with "received" says
@@ -98,7 +99,8 @@ def create_app(
         if not (0 < leg < 10**6 and 0 < stop < 10**6):
             raise InputError(f"survey {survey!r} leg {leg} stop {stop}: expected numbers from 1 to 999999")
         body = await _body(request)
-        new = await asyncio.to_thread(store.put_stop, survey, leg, stop, body)
+        replaces = request.headers.get("if-match", "").strip('"') or None
+        new = await asyncio.to_thread(store.put_stop, survey, leg, stop, body, replaces)
         if new:
             maps.begin(survey)
         return _taken(new, body)

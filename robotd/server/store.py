@@ -84,8 +84,10 @@ class Store:
             self._write(folder / "header.json", body)
             return True
 
-    def put_stop(self, name: str, leg: int, stop: int, body: bytes) -> bool:
+    def put_stop(self, name: str, leg: int, stop: int, body: bytes, replaces: str | None = None) -> bool:
         """Keep a stop; returns whether it is new.
+
+        `replaces` is the SHA-256 of the content that this one replaces, because an operator has rejected it.
 
         Raises
         ------
@@ -103,7 +105,7 @@ class Store:
             record = stop_from_json(body, where, header_from_json(self._header(name), f"survey {name!r}"))
             if (record.leg, record.stop) != (leg, stop):
                 raise InputError(f"{where}: found leg {record.leg} stop {record.stop}; expected those in the address")
-            if old is not None:
+            if old is not None and hashlib.sha256(old).hexdigest() != replaces:
                 raise ConflictError(f"{where}: the server has it with another content, and keeps that")
             self._write(path, body)
             return True

@@ -18,7 +18,6 @@ from robotd.bus import Bus
 from robotd.clock import now, run_virtual, ticks
 from robotd.config import Calibration
 from robotd.control import ControlLoop
-from robotd.daemon import Supervisor
 from robotd.errors import DriverFault
 from robotd.odometry import Odometry
 from robotd.records import DriveCommand, Withdrawal
@@ -29,6 +28,7 @@ from robotd.sim.pins import PinStates
 from robotd.sim.quirks import LineFaults
 from robotd.sim.roomba import RoombaQuirks, SimRoomba
 from robotd.sim.roomba_link import RoombaLink
+from robotd.supervisor import Supervisor
 
 PORT = "/dev/robotd/base"
 WISH_S = 0.1  # between two wishes of the same motion

@@ -23,7 +23,6 @@ from robotd.bus import Bus
 from robotd.clock import now, run_virtual
 from robotd.config import Calibration
 from robotd.control import ControlLoop
-from robotd.daemon import Supervisor
 from robotd.errors import DriverFault
 from robotd.odometry import Odometry, Wheels
 from robotd.records import DriveCommand, Event, SensorFrame, Withdrawal
@@ -31,6 +30,7 @@ from robotd.safety import SafetyGate, SafetyLimits
 from robotd.serial_log import Occurrence, Recording, read_serial_log
 from robotd.sim.hardware import SimHardware
 from robotd.sim.pins import PinStates
+from robotd.supervisor import Supervisor
 
 FOLDER = Path(__file__).parent
 TOLERANCE = 0.031  # s: two ticks of the robot
