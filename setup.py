@@ -16,6 +16,7 @@ PACKAGES = [
     "robotd.sim",
     "robotd.solver",
     "robotd.vision",
+    "robotd.workbench",
 ]
 
 # cython/<file>.pyx -> module; each has a numpy reference beside it, which runs when this build is skipped

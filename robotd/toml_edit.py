@@ -30,7 +30,7 @@ def toml(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, int | float):
         return repr(value)
-    return json.dumps(str(value))
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007F")  # TOML has no surrogates
 
 
 def replace_table(text: str, table: str, values: Mapping[str, str], where: str) -> str:

@@ -9,9 +9,9 @@ from robotd.vision.learn_pattern import learn_pattern
 from robotd.vision.mirror import Lamp, reflected
 from robotd.vision.shake import Shake, kernels
 from robotd.vision.thesis_blink import ThesisFlashConfig, ThesisFlashDetector, cost, periods_of
+from robotd.workbench.score import Score
 from tests.flashes.film import add, frames
 from tests.flashes.scenes import Light, Options, scene
-from tests.flashes.score import Score
 from tests.flashes.world import light_of, shelves
 
 SMALL = (192, 144)

@@ -40,11 +40,22 @@ LAYERS = {
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
     ],
-    3: ["plugin", "camera_driver"],
+    3: ["plugin", "camera_driver", "workbench"],
     4: ["drivers"],
     5: ["mission", "control", "wheel_runs", "recorder", "supervisor", "control_socket", "daemon", "operations"],
     6: ["sim", "server"],
-    7: ["__main__", "demo", "line_tool", "floor_tool", "record_tool", "calibrate", "doctor", "solver_main"],
+    7: [
+        "__main__",
+        "demo",
+        "line_tool",
+        "floor_tool",
+        "record_tool",
+        "workbench_tool",
+        "workbench_commands",
+        "calibrate",
+        "doctor",
+        "solver_main",
+    ],
 }
 APART = {"ctl": {"ctl", "__version__"}, "gateway": {"errors"}}
 APART |= {"guardian": {"errors", "serial_port"}, "serial_port": {"errors"}}  # and pyserial: the guardian's process

@@ -20,10 +20,10 @@ from robotd.vision.blink import FlashConfig, FlashDetector
 from robotd.vision.learn_pattern import learn_pattern
 from robotd.vision.pattern import FlashPattern
 from robotd.vision.thesis_blink import ThesisFlashConfig, ThesisFlashDetector
+from robotd.workbench.score import Score
 
 from .film import frames
 from .scenes import LABELS, Options, scene
-from .score import Score
 
 
 def main(argv: Sequence[str] | None = None) -> int:
