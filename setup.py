@@ -24,6 +24,7 @@ KERNELS = {
     "stroke": "robotd.vision._stroke",
     "cluster": "robotd.vision._cluster",
     "polyline": "robotd.vision._polyline",
+    "join": "robotd.vision._join",
     "measure": "robotd.vision._measure",
     "blink": "robotd.vision._blink",
     "sensor": "robotd.sim._sensor",

@@ -1,4 +1,4 @@
-"""Kernels of robotd.vision.evidence and robotd.vision.refine: what speaks for a line, and where exactly it lies.
+"""Kernels of robotd.vision.stroke and robotd.vision.evidence: what speaks for a line, and where exactly it lies.
 
 Their plain versions are in robotd/vision/measure_reference.py, which also says what each one computes.
 """

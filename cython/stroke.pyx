@@ -4,7 +4,11 @@ Their plain versions are in robotd/vision/stroke_reference.py, which also says w
 """
 
 from libc.math cimport fabsf, sqrtf
+from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy, memset
+
+cdef enum:
+    BLOCK = 32  # px, side of the squares that have each a threshold of their own
 
 
 cdef inline int _sector(float x, float y) noexcept nogil:
@@ -27,56 +31,85 @@ def edges(
     float factor,
     float low,
     float high,
+    float[:, ::1] level,
     int[:, ::1] index,
     unsigned char[:, ::1] sector,
     float[:, ::1] out,
 ):
-    cdef Py_ssize_t height = gx.shape[0], width = gx.shape[1], row, col, at, side, capacity = out.shape[0]
+    cdef Py_ssize_t height = gx.shape[0], width = gx.shape[1], row, col, at, side, capacity = out.shape[0], stop, i, j
+    cdef Py_ssize_t rows = level.shape[0], columns = level.shape[1] // 3
     cdef unsigned long long eight
-    cdef short bound, larger
+    cdef short larger
+    cdef short *bound = <short *> malloc(width * sizeof(short))
     cdef const short *x
     cdef const short *y
     cdef const unsigned char *inside
     cdef int *place
     cdef unsigned char *code
-    cdef int found = 0, row_sum, row_inside, square, here, least
-    cdef long long total = 0, pixels = 0
-    cdef float level, middle, before, after, bend
+    cdef int found = 0, row_sum, row_inside, square, here, least = 0
+    cdef float total, pixels, middle, before, after, bend, whole, mean = 0.0
     cdef bint across, masked = valid.shape[0] > 0
+    if bound == NULL:
+        raise MemoryError
     with nogil:
-        for row in range(0, height, 2):  # because every other row says enough
+        for i in range(rows):
+            for j in range(columns):
+                level[i, columns + j] = level[i, 2 * columns + j] = 0.0
+        for row in range(0, height, 4):  # because every fourth row says enough
             x, y = &gx[row, 0], &gy[row, 0]
-            row_sum = 0
-            row_inside = 0
-            if masked:
-                inside = &valid[row, 0]
-                for col in range(width):
-                    row_sum += inside[col] * ((x[col] if x[col] > 0 else -x[col]) + (y[col] if y[col] > 0 else -y[col]))
-                    row_inside += inside[col]
-            else:
-                for col in range(width):
-                    row_sum += (x[col] if x[col] > 0 else -x[col]) + (y[col] if y[col] > 0 else -y[col])
-                row_inside = <int> width
-            total += row_sum
-            pixels += row_inside
+            for j in range(columns):
+                stop = (j + 1) * BLOCK if j + 1 < columns else width
+                row_sum = 0
+                if masked:
+                    inside = &valid[row, 0]
+                    row_inside = 0
+                    for col in range(j * BLOCK, stop):
+                        row_sum += inside[col] * ((x[col] if x[col] > 0 else -x[col]) + (y[col] if y[col] > 0 else -y[col]))
+                        row_inside += inside[col]
+                else:
+                    for col in range(j * BLOCK, stop):
+                        row_sum += (x[col] if x[col] > 0 else -x[col]) + (y[col] if y[col] > 0 else -y[col])
+                    row_inside = <int> (stop - j * BLOCK)
+                i = row // BLOCK if row // BLOCK < rows else rows - 1
+                level[i, columns + j] += <float> row_sum
+                level[i, 2 * columns + j] += <float> row_inside
+        total = pixels = 0.0
+        for i in range(rows):
+            for j in range(columns):
+                total += level[i, columns + j]
+                pixels += level[i, 2 * columns + j]
         # the mean over all directions of |cos| + |sin| is 4 / pi
-        level = factor * 0.7853982 * <float> (<double> total / <double> (pixels if pixels > 0 else 1))
-        level = low if level < low else (high if level > high else level)
-        least = <int> (level * level)
-        bound = <short> (0.7071 * level)  # what the larger component of so long a gradient exceeds
+        factor *= 0.7853982
+        whole = factor * (total / (pixels if pixels > 1.0 else <float> 1.0))
+        for i in range(rows):
+            for j in range(columns):
+                total = pixels = 0.0
+                for row in range(i - 1 if i > 0 else 0, i + 2 if i + 2 <= rows else rows):
+                    for col in range(j - 1 if j > 0 else 0, j + 2 if j + 2 <= columns else columns):
+                        total += level[row, columns + col]
+                        pixels += level[row, 2 * columns + col]
+                total = factor * (total / (pixels if pixels > 1.0 else <float> 1.0))
+                total = total if total < whole else whole
+                level[i, j] = low if total < low else (high if total > high else total)
+                mean += level[i, j]
         for row in range(height):
             x, y, code = &gx[row, 0], &gy[row, 0], &sector[row, 0]
             if row == 0 or row == height - 1:
                 memset(code, 0, width)
                 continue
+            if row == 1 or (row % BLOCK == 0 and row // BLOCK < rows):
+                for col in range(width):  # what the larger component of so long a gradient exceeds
+                    j = col // BLOCK if col // BLOCK < columns else columns - 1
+                    bound[col] = <short> (0.7071 * level[row // BLOCK if row // BLOCK < rows else rows - 1, j])
             for col in range(width):  # apart from what follows, because so the compiler makes it wide
                 larger = x[col] if x[col] > <short> -x[col] else <short> -x[col]
                 larger = y[col] if y[col] > larger else larger
                 larger = <short> -y[col] if <short> -y[col] > larger else larger
-                code[col] = larger > bound
+                code[col] = larger > bound[col]
             code[0] = code[width - 1] = 0
         for row in range(1, height - 1):
             x, y, place, code = &gx[row, 0], &gy[row, 0], &index[row, 0], &sector[row, 0]
+            i = row // BLOCK if row // BLOCK < rows else rows - 1
             col = 0
             while col < width:
                 if col + 8 <= width:
@@ -91,6 +124,8 @@ def edges(
                 col += 1
                 at = col - 1
                 here = x[at] * x[at] + y[at] * y[at]
+                j = at // BLOCK if at // BLOCK < columns else columns - 1
+                least = <int> (level[i, j] * level[i, j])
                 if here <= least:
                     continue
                 across = x[at] * x[at] >= y[at] * y[at]
@@ -119,7 +154,8 @@ def edges(
                 place[at] = found
                 code[at] = <unsigned char> (1 + _sector(<float> x[at], <float> y[at]))
                 found += 1
-    return found, level
+        free(bound)
+    return found, mean / (rows * columns)
 
 
 cdef inline int _opposite(

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robotd.vision import _measure, _polyline, measure_reference, polyline_reference
+from robotd.vision import _join, _measure, _polyline, join_reference, measure_reference, polyline_reference
 from robotd.vision.polyline import arc_length, resample, sharpened
 from robotd.vision.stroke import LineConfig, LineDetector
 
@@ -38,9 +38,19 @@ def traced(kernels, stroke, axis):
     return found, points, pieces
 
 
-def joined(kernels, found, points, pieces):
+def floor_with(paths, width, seed, size=(160, 170), dark=60.0):
+    """Dark tape along polylines, in working pixels."""
+    mask = np.zeros((4 * size[0], 4 * size[1]), np.uint8)
+    for path in paths:
+        cv2.polylines(mask, [np.round(4 * np.asarray(path, float)).astype(np.int32)], False, 255, round(4 * width))
+    cover = cv2.resize(mask, size[::-1], interpolation=cv2.INTER_AREA) / 255.0
+    grey = 170.0 - (170.0 - dark) * cover + np.random.default_rng(seed).normal(0.0, 3.0, size)
+    return np.clip(cv2.GaussianBlur(grey, (0, 0), 0.9), 0, 255).astype(np.uint8)
+
+
+def joined(kernels, image, found, points, pieces):
     out_points, out = np.zeros((3000, 2), np.float32), np.zeros((20, 11), np.float32)
-    count = kernels.join(points, pieces, found, out_points, out)
+    count = kernels.join(image, NO_MASK, -1.0, points, pieces, found, out_points, out)
     return count, out_points[: int(out[:count, 1].sum())], out[:count]
 
 
@@ -61,7 +71,8 @@ def test_traces_and_joints_are_those_of_numpy(name, seed):
     assert ours[0] == plain[0] >= 1
     np.testing.assert_allclose(ours[1], plain[1], atol=2e-2)
     np.testing.assert_allclose(ours[2], plain[2], rtol=1e-3, atol=2e-3)
-    one, two = joined(_polyline, *ours), joined(polyline_reference, *ours)
+    image = floor_with(PATHS[name], 11.0, seed)
+    one, two = joined(_join, image, *ours), joined(join_reference, image, *ours)
     assert one[0] == two[0]
     np.testing.assert_allclose(one[1], two[1], atol=1e-3)
     np.testing.assert_allclose(one[2], two[2], rtol=1e-3, atol=1e-3)
@@ -77,7 +88,52 @@ def test_a_taper_is_measured_and_is_no_spread():
 
 @pytest.mark.parametrize(("name", "lines"), [("dashes", 1), ("corner", 1), ("crossing", 2)])
 def test_dashes_and_corners_are_joined_and_crossings_go_straight_on(name, lines):
-    assert joined(_polyline, *traced(_polyline, *strokes_along(PATHS[name], 11.0, 2)))[0] == lines
+    found = traced(_polyline, *strokes_along(PATHS[name], 11.0, 2))
+    assert joined(_join, floor_with(PATHS[name], 11.0, 2), *found)[0] == lines
+
+
+def test_pieces_of_other_contrast_are_not_joined():
+    bold, faint = PATHS["corner"][:1], PATHS["corner"][1:]
+    found = traced(_polyline, *strokes_along([*bold, *faint], 11.0, 2))
+    image = np.minimum(floor_with(bold, 11.0, 2), floor_with(faint, 11.0, 2, dark=140.0))
+    assert joined(_join, image, *found)[0] == 2
+
+
+def extended(kernels, image, path, width, valid=NO_MASK):
+    path = resample(np.asarray(path, float), 4.0).astype(np.float32)
+    length = arc_length(path.astype(float))[-1]
+    pieces = np.array([[0, len(path), width, 0.0, 0.5, 20, 20, 70, 0, 0.3, length]], np.float32)
+    out_points, out = np.zeros((500, 2), np.float32), np.zeros((1, 11), np.float32)
+    added = kernels.extend(
+        image, valid, -1.0, path, pieces, 1, np.empty((200, 2), np.float32), out_points, out
+    )  # fmt: skip
+    return added, out_points[: int(out[0, 1])], out
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("name", ["straight", "bend", "crossing", "corner"])
+def test_what_follows_a_piece_is_that_of_numpy(name, masked):
+    valid = NO_MASK
+    if masked:
+        valid = np.ones((160, 170), np.uint8)
+        valid[:, 120:] = 0
+    image = floor_with(PATHS[name], 11.0, 4)
+    known = resample(np.asarray(PATHS[name][0], float), 2.0)[12:26]
+    ours, plain = extended(_join, image, known, 11.0, valid), extended(join_reference, image, known, 11.0, valid)
+    assert ours[0] == plain[0] > 3
+    np.testing.assert_allclose(ours[1], plain[1], atol=0.02)
+    np.testing.assert_allclose(ours[2], plain[2], rtol=1e-3, atol=0.02)
+
+
+def test_a_line_is_followed_round_bends_and_through_shadows_to_its_end():
+    path = np.array([[20.0, 20.0], [60.0, 24.0], [100.0, 50.0], [130.0, 100.0]])
+    image = floor_with([path], 10.0, 1)
+    image[:, 70:] = (0.4 * image[:, 70:]).astype(np.uint8)  # a shadow with a hard edge
+    _, points, _ = extended(_join, image, [(30.0, 21.0), (55.0, 23.5)], 10.0)
+    assert np.hypot(*(points[0] - path[0])) < 8.0
+    assert np.hypot(*(points[-1] - path[-1])) < 8.0
+    truth = resample(path, 0.5)
+    assert np.sqrt(((points[:, None] - truth[None]) ** 2).sum(axis=2)).min(axis=1).max() < 2.5
 
 
 def picture(seed, width=16.0):

@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robotd.vision import _stroke, cluster_reference, measure_reference, polyline_reference, stroke_reference
+from robotd.vision import (
+    _stroke,
+    cluster_reference,
+    join_reference,
+    measure_reference,
+    polyline_reference,
+    stroke_reference,
+)
 from robotd.vision.polyline import arc_length
 from robotd.vision.stroke import LineConfig, LineDetector
 
@@ -116,6 +123,26 @@ def test_a_circle_closes():
     assert np.abs(radius - 80).max() < 1.0
 
 
+def test_two_lines_with_sharp_turns_share_no_points():
+    angle = np.linspace(np.pi, 0.0, 40)
+    bow = np.column_stack([75 + 30 * np.cos(angle), 70 - 30 * np.sin(angle)])
+    paths = [[(45, 239), *bow, (105, 239)], [(190, 0), (190, 120), (299, 120)]]
+    lines = LineDetector(LineConfig("dark", (9, 14))).detect(draw(paths, 12))
+    assert len(lines) == 2
+    for path in paths:
+        assert min(distance_to(line.points, dense(path)).max() for line in lines) < 3.0
+
+
+def test_a_line_is_found_in_a_deep_shadow_beside_bright_light():
+    image = draw([[(60, 0), (100, 239)]], 14, dark=120, noise=2.0)
+    image[:, :150] = (0.3 * image[:, :150]).astype(np.uint8)
+    texture = np.random.default_rng(5).normal(0.0, 60.0, (H, W - 150))
+    image[:, 150:] = np.clip(170.0 + cv2.GaussianBlur(texture, (0, 0), 1.2), 0, 255).astype(np.uint8)
+    lines = LineDetector(LineConfig("dark", (11, 18))).detect(image)
+    assert len(lines) == 1
+    assert distance_to(lines[0].points, dense([(60, 0), (100, 239)])).max() < 2.0
+
+
 def test_low_contrast_is_enough():
     image = draw([[(0, 60), (299, 180)]], 16, dark=110, floor=150, noise=3.0)
     lines = LineDetector(LineConfig("dark", (13, 20))).detect(image)
@@ -205,7 +232,8 @@ def run(kernels, seed, sign=-1.0, most=2700, masked=True):
         valid = np.empty((0, 0), np.uint8)
     index, sector = np.full(gx.shape, -1, np.int32), np.empty(gx.shape, np.uint8)
     edge, partner, stroke = np.empty((most, 5), np.float32), np.empty(most, np.int32), np.empty((most, 6), np.float32)
-    found, level = kernels.edges(gx, gy, valid, 1.3, 24.0, 90.0, index, sector, edge)
+    levels = np.empty((gx.shape[0] // 32, 3 * (gx.shape[1] // 32)), np.float32)
+    found, level = kernels.edges(gx, gy, valid, 1.3, 24.0, 90.0, levels, index, sector, edge)
     count = kernels.strokes(edge, found, index, sector, 8.0, 15.0, sign, 0.88, 0.4, partner, stroke)
     return found, level, sector, np.where(sector > 0, index, -1), edge[:found], partner[:found], stroke[:count]
 
@@ -234,7 +262,11 @@ def test_the_plain_kernels_find_the_same_lines(monkeypatch):
     image = draw([[(0, 60), (170, 60), (170, 239)]], 16)
     expected = LineDetector(LineConfig("dark", (13, 20))).detect(image)
     plain = dict(
-        kernels=stroke_reference, clustering=cluster_reference, tracing=polyline_reference, measuring=measure_reference
+        kernels=stroke_reference,
+        clustering=cluster_reference,
+        tracing=polyline_reference,
+        joining=join_reference,
+        measuring=measure_reference,
     )
     for name, module in plain.items():
         monkeypatch.setattr(f"robotd.vision.stroke.{name}", module)

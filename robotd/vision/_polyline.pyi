@@ -16,10 +16,3 @@ def trace(
     points: NDArray[np.float32],
     pieces: NDArray[np.float32],
 ) -> int: ...
-def join(
-    points: NDArray[np.float32],
-    pieces: NDArray[np.float32],
-    count: int,
-    out_points: NDArray[np.float32],
-    out_pieces: NDArray[np.float32],
-) -> int: ...

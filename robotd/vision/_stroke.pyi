@@ -8,6 +8,7 @@ def edges(
     factor: float,
     low: float,
     high: float,
+    level: NDArray[np.float32],
     index: NDArray[np.int32],
     sector: NDArray[np.uint8],
     out: NDArray[np.float32],

@@ -92,7 +92,7 @@ def explain(detector: LineDetector, gray: Bytes, valid: NDArray[np.bool_] | None
         work = detector._prepare(level, gray, mask)
         count, threshold = kernels.edges(
             work.gx, work.gy, work.valid, stroke.THRESHOLD_FACTOR, stroke.THRESHOLD_LOW, stroke.THRESHOLD_HIGH,
-            work.index, work.sector, work.edge,
+            work.level, work.index, work.sector, work.edge,
         )  # fmt: skip
         edge = work.edge[:count].astype(np.float64)
         edges = np.column_stack([_given(edge[:, :2], level.scale), edge[:, 2:4]])

@@ -63,6 +63,7 @@ class MarkFinder:
         # because blur and gradient reach 3 px
         eroded = cv2.erode(shown, np.ones((7, 7), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
         self._valid = np.asarray(eroded, dtype=np.uint8)
+        self._level = np.empty((1, 3), np.float32)  # one threshold for all
         self._index = np.empty(shape, np.int32)
         self._sector = np.empty(shape, np.uint8)
         most = max(height * columns // 4, 64)
@@ -80,8 +81,9 @@ class MarkFinder:
         blurred = cv2.GaussianBlur(grey, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE)
         gx, gy = (np.asarray(part, dtype=np.int16) for part in cv2.spatialGradient(blurred))
         count, _ = kernels.edges(
-            gx, gy, self._valid, THRESHOLD_FACTOR, THRESHOLD_LOW, THRESHOLD_HIGH, self._index, self._sector, self._edge
-        )
+            gx, gy, self._valid, THRESHOLD_FACTOR, THRESHOLD_LOW, THRESHOLD_HIGH,
+            self._level, self._index, self._sector, self._edge,
+        )  # fmt: skip
         low, high = self._width * (1.0 - TOLERANCE), self._width * (1.0 + TOLERANCE)
         marks = [np.empty((0, 2))]
         for sign in self._signs:

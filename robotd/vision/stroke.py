@@ -3,8 +3,9 @@
 Thesis section 5.2.3 and its paper, mended (errata B9-B16). A line is bounded by two edges at a constant distance whose
 gradients oppose each other. From every thin edge pixel we walk along the gradient to an opposite edge; pairs that find
 each other give a stroke, of which only the centre is kept. Centres that agree in place, width and direction are
-clustered by density, traced into polylines, joined over gaps and corners, and judged (`evidence.py`). Those accepted
-are measured again at full resolution, border by border (`refine.py`). There is no split into start and end pixels, so
+clustered by density, traced into polylines, joined over gaps and corners, and judged (`evidence.py`). What may be a
+line is followed on from its ends for as long as both borders go on, and judged again. Those accepted are measured at
+full resolution, border by border. There is no split into start and end pixels, so
 all orientations are equal. The image is reduced so that the line is 8 to 28 pixels wide: texture finer than that
 disappears, and the cost does not grow with the line's width.
 """
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Floats, Line
-from . import measure_reference, polyline_reference, stroke_reference
+from . import join_reference, measure_reference, polyline_reference, stroke_reference
 from .cluster import dbscan
 from .cluster import kernels as clustering
 from .evidence import confidence, without_doubles
@@ -28,11 +29,13 @@ from .polyline import SHARP, sharpened
 from .thesis_line import detect_thesis
 
 try:
+    from . import _join as joining
     from . import _measure as measuring
     from . import _polyline as tracing
     from . import _stroke as kernels
 except ImportError:  # built with ROBOTD_NO_EXTENSIONS=1
     kernels = stroke_reference  # type: ignore[misc]
+    joining = join_reference  # type: ignore[misc]
     tracing = polyline_reference  # type: ignore[misc]
     measuring = measure_reference  # type: ignore[misc]
 
@@ -52,6 +55,7 @@ LEAST_LENGTH = 0.8  # widths of a piece worth joining or judging
 MOST_SPREAD = 0.16  # of the stroke width: beyond it no other evidence makes up for it
 MOST_CLUSTERS = 32  # the largest, that are traced at one scale
 MOST_PIECES = 48  # that are traced at one scale
+PROMISING = 0.03  # confidence from which a piece is followed beyond its ends
 # Plain weights, because Mahalanobis's (thesis 8.2.4) were no better: width and direction of neighbouring strokes are
 # hardly correlated (|r| < 0.04), and at four scales F1 was 0.953 to 0.960 against 0.959 on 60 scenes.
 WIDTH_WEIGHT = 4.0  # 28 % of width weighs as much as half a width of distance
@@ -104,6 +108,7 @@ class _Workspace:
     valid: Bytes
     gx: NDArray[np.int16]
     gy: NDArray[np.int16]
+    level: Singles
     index: NDArray[np.int32]
     sector: Bytes
     edge: Singles
@@ -115,6 +120,8 @@ class _Workspace:
     backward: Singles
     points: Singles
     pieces: Singles
+    longer_points: Singles
+    longer: Singles
     joined_points: Singles
     joined: Singles
     features: Floats
@@ -140,6 +147,7 @@ class _Workspace:
             valid=_NO_MASK,
             gx=np.empty(size, np.int16),
             gy=np.empty(size, np.int16),
+            level=np.empty((max(height // 32, 1), 3 * max(width // 32, 1)), np.float32),
             index=np.empty(size, np.int32),
             sector=np.empty(size, np.uint8),
             edge=np.empty((most, 5), np.float32),
@@ -151,7 +159,9 @@ class _Workspace:
             backward=np.empty((way, 2), np.float32),
             points=np.empty((4 * way, 2), np.float32),
             pieces=np.empty((MOST_PIECES, 11), np.float32),
-            joined_points=np.empty((4 * way + 2 * MOST_PIECES, 2), np.float32),
+            longer_points=np.empty((6 * way, 2), np.float32),
+            longer=np.empty((MOST_PIECES, 11), np.float32),
+            joined_points=np.empty((6 * way + 2 * MOST_PIECES, 2), np.float32),
             joined=np.empty((MOST_PIECES, 11), np.float32),
             features=np.empty((strokes, 5)),
             sorting=np.empty((4, max(strokes, height + 2, width + 2)), np.int32),
@@ -240,7 +250,7 @@ class LineDetector:
         work = self._prepare(level, gray, mask)
         found, _ = kernels.edges(
             work.gx, work.gy, work.valid, THRESHOLD_FACTOR, THRESHOLD_LOW, THRESHOLD_HIGH,
-            work.index, work.sector, work.edge,
+            work.level, work.index, work.sector, work.edge,
         )  # fmt: skip
         lines: list[Line] = []
         for sign in {"dark": (-1.0,), "bright": (1.0,), "both": (-1.0, 1.0)}[self.config.polarity]:
@@ -248,18 +258,54 @@ class LineDetector:
                 work.edge, found, work.index, work.sector, level.least, level.greatest,
                 sign, PARALLEL, MUTUAL, work.partner, work.stroke,
             )  # fmt: skip
-            pieces = _traced(work, strokes, level)
+            pieces = _traced(work, strokes, level, sign)
             if pieces == 0:
                 continue
-            measuring.judge(
-                work.blurred, work.valid, work.joined_points, work.joined, pieces, sign, strokes,
-                work.scratch, work.evidence,
-            )  # fmt: skip
-            sure = confidence(work.evidence[:pieces], work.joined[:pieces, 10], self._doubt)
-            for k in np.flatnonzero(sure >= self.config.min_confidence):
-                if level.low <= work.joined[k, 2] <= level.high:
-                    lines.append(_refined(work, int(k), gray, self._mask, 1.0 / level.scale, sign, float(sure[k])))
+            for path, row, sure in self._likely(work, pieces, sign, strokes):
+                if sure >= self.config.min_confidence and level.low <= row[2] <= level.high:
+                    lines.append(_refined(work, path, row, gray, self._mask, 1.0 / level.scale, sign, sure))
         return lines
+
+    def _likely(self, work: _Workspace, pieces: int, sign: float, strokes: int) -> list[tuple[Singles, Singles, float]]:
+        """Path, row and confidence of each joined piece; the promising ones once more where they can be followed on.
+
+        What follows may be joined again, and then counts instead of its parts if it is at least as likely a line.
+        """
+        sure = self._judged(work, work.joined_points, work.joined, pieces, sign, strokes)
+        chosen = np.flatnonzero(sure >= min(PROMISING, self.config.min_confidence))
+        if len(chosen) == 0:
+            return []
+        rows, sure = work.joined[chosen], sure[chosen]
+        added = joining.extend(
+            work.blurred, work.valid, sign, work.joined_points, rows, len(rows),
+            work.forward, work.longer_points, work.longer,
+        )  # fmt: skip
+        if added == 0:
+            return [(_path(work.joined_points, row), row, float(share)) for row, share in zip(rows, sure, strict=True)]
+        grown = joining.join(
+            work.blurred, work.valid, sign, work.longer_points, work.longer, len(rows), work.points, work.pieces
+        )
+        surer = self._judged(work, work.points, work.pieces, grown, sign, strokes)
+        found = [
+            (_path(work.points, row), row, float(share)) for row, share in zip(work.pieces[:grown], surer, strict=True)
+        ]
+        least = self.config.min_confidence
+        for row, share in zip(rows, sure, strict=True):
+            path = _path(work.joined_points, row)
+            for k, (whole, of, other) in enumerate(found):
+                if other >= least and _lies_on(path, whole, 0.5 * float(of[2])):
+                    found[k] = whole, of, max(other, float(share))
+                    break
+            else:
+                found.append((path, row, float(share)))
+        return found
+
+    def _judged(
+        self, work: _Workspace, points: Singles, pieces: Singles, count: int, sign: float, strokes: int
+    ) -> Floats:
+        """How sure each of the first `count` pieces is a line."""
+        measuring.judge(work.blurred, work.valid, points, pieces, count, sign, strokes, work.scratch, work.evidence)
+        return confidence(work.evidence[:count], pieces[:count, 10], self._doubt)
 
     def _prepare(self, level: _Level, gray: Bytes, mask: Bytes | None) -> _Workspace:
         """Reduce, blur and differentiate into the buffers."""
@@ -315,7 +361,7 @@ def _plausible(shape: tuple[int, ...]) -> tuple[float, float]:
     return 4.0, max(min(shape) / WIDEST, 8.0)
 
 
-def _traced(work: _Workspace, strokes: int, level: _Level) -> int:
+def _traced(work: _Workspace, strokes: int, level: _Level, sign: float) -> int:
     """Cluster the stroke centres, trace every cluster, and join what belongs together; returns how many pieces."""
     if strokes < 6:
         return 0
@@ -335,17 +381,31 @@ def _traced(work: _Workspace, strokes: int, level: _Level) -> int:
         work.sorted, work.counts, work.first[: clusters + 1], work.axis, ALIGNED, LEAST_LENGTH, MOST_SPREAD,
         work.state, work.place, work.forward, work.backward, work.points, work.pieces,
     )  # fmt: skip
-    return tracing.join(work.points, work.pieces, pieces, work.joined_points, work.joined)
+    return joining.join(
+        work.blurred, work.valid, sign, work.points, work.pieces, pieces, work.joined_points, work.joined
+    )
 
 
-def _refined(work: _Workspace, piece: int, gray: Bytes, mask: Bytes, grain: float, sign: float, sure: float) -> Line:
+def _path(points: Singles, row: Singles) -> Singles:
+    """The points (N, 2) of a piece."""
+    return points[int(row[0]) : int(row[0] + row[1])]
+
+
+def _lies_on(path: Singles, other: Singles, near: float) -> bool:
+    """Whether nearly all points of a path are `near` a point of another; every third says enough."""
+    gaps = ((path[::3, None] - other[None, ::2]) ** 2).sum(axis=2).min(axis=1)
+    return bool(np.mean(gaps < near * near) > 0.8)
+
+
+def _refined(
+    work: _Workspace, path: Singles, row: Singles, gray: Bytes, mask: Bytes, grain: float, sign: float, sure: float
+) -> Line:
     """A piece measured again, border by border, at the resolution of the given image; `grain` pixels were one."""
-    start, count, width, slope = (float(value) for value in work.joined[piece, :4])
-    path = work.joined_points[int(start) : int(start + count)]
-    closed = bool(work.joined[piece, 8])
+    width, slope, closed = float(row[2]), float(row[3]), bool(row[8])
     found, width, turn = measuring.refine(gray, mask, path, width, slope, closed, grain, sign, work.scratch, work.exact)
-    points = work.exact[:found]
-    points = sharpened(points, width) if turn > SHARP else points.copy()
+    points = work.exact[:found].copy()  # because the next line uses the buffer again
+    if turn > SHARP:
+        points = sharpened(points, width)
     normals, curvature = np.empty_like(points), np.empty(len(points))
     measuring.shape(points, CURVATURE_REACH * width, closed, normals, np.empty(len(points)), curvature)
     return Line(points, width, sure, normals, curvature, "dark" if sign < 0.0 else "bright", closed)

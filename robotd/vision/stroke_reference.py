@@ -14,6 +14,8 @@ Singles = NDArray[np.float32]
 Integers = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
+BLOCK = 32  # px, side of the squares that have each a threshold of their own
+
 
 def edges(
     gx: NDArray[np.int16],
@@ -22,14 +24,16 @@ def edges(
     factor: float,
     low: float,
     high: float,
+    level: Singles,
     index: Integers,
     sector: Bytes,
     out: Singles,
 ) -> tuple[int, float]:
     """Thin edges: pixels whose gradient is a local maximum along the axis that it is nearest to.
 
-    A parabola through the three magnitudes gives the sub-pixel position on that axis. The threshold is `factor` times
-    the mean magnitude of the valid pixels, clipped to [low, high].
+    A parabola through the three magnitudes gives the sub-pixel position on that axis. Each square of 32 x 32 pixels
+    has its own threshold, because a shadow weakens edges and a pattern makes many: `factor` times the mean magnitude of
+    the valid pixels in it and the squares round it, but not more than of the whole image, clipped to [low, high].
 
     Parameters
     ----------
@@ -39,26 +43,41 @@ def edges(
         1 where the derivatives may be used, 0 elsewhere; no rows if all may be.
     sector : (H, W) uint8 array to fill
         0 where there is no thin edge, else 1 + which sixteenth of the circle its gradient is in, from +u towards +v.
+    level : (max(H // 32, 1), 3 * max(W // 32, 1)) array to fill
+        The thresholds, in the first third of the columns; the rest is scratch. What is left over on the right and
+        below belongs to the last squares.
     index : (H, W) array to fill
         For each thin edge pixel its row of `out`; undefined elsewhere.
     out : (N, 5) array to fill with edges, row by row of the image; further ones are dropped.
 
     Returns
     -------
-    How many edges were found, and the threshold.
+    How many edges were found, and the mean of the thresholds.
     """
     wide_x, wide_y = gx.astype(np.int32), gy.astype(np.int32)
     usable = np.ones(gx.shape, bool) if len(valid) == 0 else valid > 0
-    total = int(((np.abs(wide_x) + np.abs(wide_y)) * usable)[::2].sum(dtype=np.int64))  # every other row says enough
+    strength = ((np.abs(wide_x) + np.abs(wide_y)) * usable)[::4]  # because every fourth row says enough
+    rows, columns = level.shape[0], level.shape[1] // 3
+    down, right = np.arange(rows) * (BLOCK // 4), np.arange(columns) * BLOCK
+    sums, pixels = (
+        np.add.reduceat(np.add.reduceat(part, right, axis=1), down, axis=0).astype(np.float32)
+        for part in (strength, usable[::4].astype(np.int32))
+    )
     # the mean over all directions of |cos| + |sin| is 4 / pi
-    mean = np.float32(factor) * np.float32(0.7853982) * np.float32(total / max(int(usable[::2].sum()), 1))
-    level = np.float32(min(max(float(mean), low), high))
+    share = np.float32(factor) * np.float32(0.7853982)
+    whole = share * (sums.sum(dtype=np.float32) / max(pixels.sum(dtype=np.float32), np.float32(1.0)))
+    sums, pixels = _around(sums), _around(pixels)
+    means = np.minimum(share * (sums / np.maximum(pixels, np.float32(1.0))), whole)
+    level[:, :columns] = np.clip(means, np.float32(low), np.float32(high))
+    of_row = np.minimum(np.arange(gx.shape[0]) // BLOCK, rows - 1)
+    of_column = np.minimum(np.arange(gx.shape[1]) // BLOCK, columns - 1)
+    least = (level[:, :columns] * level[:, :columns]).astype(np.int32)[of_row[:, None], of_column]
     square = wide_x * wide_x + wide_y * wide_y
     across = (wide_x * wide_x >= wide_y * wide_y)[1:-1, 1:-1]
     here = square[1:-1, 1:-1]
     before = np.where(across, square[1:-1, :-2], square[:-2, 1:-1])
     after = np.where(across, square[1:-1, 2:], square[2:, 1:-1])
-    peak = (here > int(level * level)) & (here >= before) & (here > after) & usable[1:-1, 1:-1]
+    peak = (here > least[1:-1, 1:-1]) & (here >= before) & (here > after) & usable[1:-1, 1:-1]
     peak &= np.where(across, usable[1:-1, :-2] & usable[1:-1, 2:], usable[:-2, 1:-1] & usable[2:, 1:-1])
     rows, cols = np.nonzero(peak)
     rows, cols = rows[: len(out)], cols[: len(out)]
@@ -74,7 +93,18 @@ def edges(
     index[rows, cols] = np.arange(found, dtype=np.int32)
     sector[:] = 0
     sector[rows, cols] = 1 + _sector(gx[rows, cols].astype(np.float32), gy[rows, cols].astype(np.float32))
-    return found, float(level)
+    return found, float(level[:, :columns].mean())
+
+
+def _around(blocks: Singles) -> Singles:
+    """Sums over each block and those that touch it."""
+    padded = np.pad(blocks, 1)
+    rows, columns = blocks.shape
+    total = np.zeros_like(blocks)
+    for i in range(3):
+        for j in range(3):
+            total += padded[i : i + rows, j : j + columns]
+    return total
 
 
 def _sector(x: Singles, y: Singles) -> NDArray[np.int64]:
