@@ -64,6 +64,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     for kind, text in (("csv", "a table"), ("png", "a picture from above"), ("html", "a page to turn around in")):
         solve.add_argument(f"--{kind}", type=Path, metavar="PATH", help=f"also write {text}")
+    solve.add_argument(
+        "--report",
+        type=Path,
+        metavar="TXT",
+        help="also write what is observable, how sensors scatter, what is doubtful",
+    )
     solve.set_defaults(run=_solve)
 
     evaluate = commands.add_parser("evaluate", help="compare a map with the truth")
@@ -190,7 +196,17 @@ def _solve(arguments: argparse.Namespace) -> int:
     survey = load_survey(arguments.survey)
     if arguments.known is not None:
         survey = _with_known(survey, arguments.known)
-    result = solve(survey, method=arguments.method)
+    _check_units(survey, arguments.survey)
+    if arguments.report is not None:
+        from .files import write_atomic
+        from .solver.analysis import analyse, analysis_text
+
+        if arguments.method != "bundle":
+            raise InputError("--report judges a bundle adjustment; leave out --method linear")
+        result, analysis = analyse(survey)
+        write_atomic(arguments.report, analysis_text(analysis).encode())
+    else:
+        result = solve(survey, method=arguments.method)
     if arguments.output is None:
         sys.stdout.write(map_to_json(result).decode())
         sys.stdout.flush()
@@ -202,6 +218,14 @@ def _solve(arguments: argparse.Namespace) -> int:
         _draw(arguments, result, survey)
     _summarise(result)
     return 0
+
+
+def _check_units(survey: Survey, path: Path) -> None:
+    from .survey_checks import Problems, check_units
+
+    problems = Problems(str(path))
+    check_units(survey, problems)
+    problems.raise_if_any()
 
 
 def _with_known(survey: Survey, path: Path) -> Survey:
@@ -275,17 +299,15 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     from .files import load_survey
+    from .solver.analysis import observability
 
     survey = load_survey(arguments.survey)
-    stops_of: dict[str, set[tuple[int, int]]] = {}
-    for stop in survey.stops:
-        for sighting in stop.sightings:
-            stops_of.setdefault(sighting.label, set()).add((stop.leg, stop.stop))
+    _check_units(survey, arguments.survey)
+    labels = {sighting.label for stop in survey.stops for sighting in stop.sightings}
     sightings = sum(len(stop.sightings) for stop in survey.stops)
-    print(f"{arguments.survey}: no mistake; {len(survey.stops)} stops, {len(stops_of)} labels, {sightings} sightings")
-    once = sorted(label for label, stops in stops_of.items() if len(stops) == 1)
-    if once:
-        print(f"seen from one stop only, so that they may get no position: {', '.join(once)}")
+    print(f"{arguments.survey}: no mistake; {len(survey.stops)} stops, {len(labels)} labels, {sightings} sightings")
+    for text in observability(survey) if survey.stops else ():
+        print(text)
     return 0
 
 

@@ -13,12 +13,23 @@ from numpy.typing import NDArray
 
 from .bind import describe
 from .errors import InputError
-from .records import CameraModel, MappedLabel, Matrix3, Rig, RoofCamera, Stop
+from .records import CameraModel, MappedLabel, Matrix3, Rig, RoofCamera, Stop, Survey
 
 T = TypeVar("T")
 
 DISTORTION_LENGTHS = {"brown-conrady": (4, 5, 8), "fisheye": (4,)}  # the coefficient counts OpenCV takes
 ROUNDING = 1e-6  # relative to the largest entry; a covariance printed with seven digits passes
+
+
+# beyond these a number is of another unit: no robot is as large, no floor as steep, no store as long
+FARTHEST_ON_ROBOT_M = 5.0
+FARTHEST_LABEL_M = 2000.0
+HIGHEST_LABEL_M = 50.0
+LONGEST_MOVE_M = 500.0
+WIDEST_PRIOR = {"tilt_rad": 0.5, "camera_rotation_rad": 1.0, "camera_translation_m": 2.0}
+FULL_TURN = 2.0 * np.pi + 1e-9
+METRES, RADIANS = "metres; are these millimetres?", "radians; are these degrees?"
+SHORTEST_FOCAL = 0.02  # of the image's width: wider than any lens
 
 
 class Problems:
@@ -67,6 +78,46 @@ def check_header(parts: Mapping[str, Any], problems: Problems) -> None:
             _size(roof.size, f"roof_cameras[{index}].size", problems)
             if np.linalg.matrix_rank(_scaled(roof.H_world_image)[0]) < 3:
                 problems.add(f"roof_cameras[{index}].H_world_image", "is singular; expected an invertible homography")
+
+
+def check_units(survey: Survey, problems: Problems) -> None:
+    """Name what is finite but of another unit than expected: millimetres, degrees, coordinates in image widths.
+
+    Not asked of every file, because records may be passed on as they are; a map needs them to be right.
+    """
+    for index, camera in enumerate(survey.rig.cameras):
+        path = f"rig.cameras[{index}]"
+        mount = camera.T_robot_camera
+        _within(
+            max(map(abs, mount.translation)),
+            FARTHEST_ON_ROBOT_M,
+            f"{path}.T_robot_camera.translation",
+            METRES,
+            problems,
+        )
+        turn = sum(value * value for value in mount.rotation) ** 0.5
+        _within(turn, FULL_TURN, f"{path}.T_robot_camera.rotation", RADIANS, problems)
+        if _is_size(camera.size) and 0.0 < camera.matrix[0] < SHORTEST_FOCAL * camera.size[0]:
+            problems.add(f"{path}.matrix", f"found a focal length of {camera.matrix[0]:g}; expected pixels")
+    for name, place in survey.rig.beacons.items():
+        _within(max(map(abs, place)), FARTHEST_ON_ROBOT_M, f"rig.beacons.{name}", METRES, problems)
+    for name, most in WIDEST_PRIOR.items():
+        unit = METRES if name.endswith("_m") else RADIANS
+        _within(getattr(survey.priors, name), most, f"priors.{name}", unit, problems)
+    for index, known in enumerate(survey.known_labels):
+        x, y, z = map(abs, known.position)
+        _within(max(x, y), FARTHEST_LABEL_M, f"known_labels[{index}].position", METRES, problems)
+        _within(z, HIGHEST_LABEL_M, f"known_labels[{index}].position[2]", METRES, problems)
+    for index, stop in enumerate(survey.stops):
+        if stop.move is not None:
+            path = f"stops[{index}].move (leg {stop.leg} stop {stop.stop})"
+            _within(max(abs(stop.move.dx), abs(stop.move.dy)), LONGEST_MOVE_M, f"{path}.dx, dy", METRES, problems)
+            _within(abs(stop.move.dheading), FULL_TURN, f"{path}.dheading", RADIANS, problems)
+
+
+def _within(value: float, most: float, path: str, unit: str, problems: Problems) -> None:
+    if value > most:
+        problems.add(path, f"found {value:g}; expected up to {most:g} {unit}")
 
 
 def check_stops(

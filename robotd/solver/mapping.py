@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -34,7 +35,13 @@ from .robust import OUTLIER, Optimum, optimise
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
 _TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
 _TRUSTED_STOPS = 4  # agreement from as many is no chance, however many other sightings disagree
+_FITS = 0.5  # share of the survey's sightings below which its calibration or its units are doubted
+_FITS_NOT = 0.45  # and below which nothing is placed
+_LEAST_LIGHTS = 20  # to say so
+_CLEARLY_BETTER = 0.25  # of that share, to blame two cameras
+_MOST_TO_TRY = 5000  # sightings
 _OUTSIDE_M = 0.5  # a position so far outside all others may be an image in a shop window or a glossy shelf
+_SAME_PLACE_M = 0.05
 _CLEARLY_NEARER_M = 0.2
 _UNKNOWN = np.diag([1e6, 1e6, np.pi**2])  # covariance of a stop that nothing ties to the world
 
@@ -86,7 +93,8 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
     square = (linear.residual**2).sum(axis=1)
     counts = Counter(problem.columns.names)
     tally = _tally(asked, optimum)
-    labels = tuple(_label(asked, optimum, tally, i, counts[label]) for i, label in enumerate(problem.labels))
+    share = _share(optimum)
+    labels = tuple(_label(asked, optimum, tally, i, counts[label], share) for i, label in enumerate(problem.labels))
     located = np.array([m.status in ("placed", "known") for m in labels], dtype=np.bool_)
     residual_px = linear.residual * problem.sightings.sigma[:, None]
     inlier = optimum.inlier
@@ -98,6 +106,8 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
             f"leg/stop {', '.join(lost)} share too few labels with the rest to be joined to it; their poses are in "
             "their own odometry frame; map some of the same labels from both"
         )
+    if share < _FITS:
+        notes.append(_misfit(asked, share))
     if len(problem.sightings) == 0:
         notes.append("the survey has no usable sightings, so no label has a position")
     cost = 0.5 * (square[inlier].sum() + (linear.move**2).sum() + (linear.roof**2).sum())
@@ -173,7 +183,41 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
     )
 
 
-def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int) -> MappedLabel:
+def _share(optimum: Optimum) -> float:
+    """Share of the lights that the map explains, among those of labels that two stops or more saw.
+
+    Of rival sightings one is right; what lies in glass or floor is explained too. Too few sightings say nothing.
+    """
+    problem, s = optimum.problem, optimum.problem.sightings
+    seen = stops_per_label(s.label, s.stop, len(problem.labels))[s.label] >= 2
+    groups = np.unique(s.rival[seen])
+    if len(groups) < _LEAST_LIGHTS:
+        return 1.0
+    return float(np.isin(groups, s.rival[seen & (optimum.inlier | optimum.reflected)]).mean())
+
+
+def _misfit(asked: Problem, share: float) -> str:
+    """What to say of a survey most of whose sightings do not fit; looks whether two cameras were mistaken."""
+    text = f"only {100 * share:.0f} % of the sightings fit any map, so few labels are placed"
+    names = [camera.name for camera in asked.cameras]
+    best, swap = share + _CLEARLY_BETTER, None
+    if len(asked.sightings) <= _MOST_TO_TRY:
+        for pair in combinations(names, 2):
+            renamed = {pair[0]: pair[1], pair[1]: pair[0]}
+            cameras = tuple(replace(c, name=renamed.get(c.name, c.name)) for c in asked.survey.rig.cameras)
+            tried = replace(asked.survey, rig=replace(asked.survey.rig, cameras=cameras))
+            found = _share(optimise(build_problem(tried)))
+            if found > best:
+                best, swap = found, pair
+    if swap is not None:
+        return (
+            f"{text}; with cameras {swap[0]} and {swap[1]} exchanged {100 * best:.0f} % do: check rig.cameras and the "
+            "robot's cables"
+        )
+    return f"{text}; check the rig (which camera is which, metres, radians), the labels' ids and the moves' units"
+
+
+def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, share: float) -> MappedLabel:
     problem, label = optimum.problem, asked.labels[i]
     inliers = tally.inliers[i]
     position, covariance = tally.position[i], tally.covariance[row] if (row := tally.row[i]) >= 0 else None
@@ -202,6 +246,8 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int) 
         )
     if tally.agreeing_stops[i] < _TRUSTED_STOPS and tally.doubting[i] >= tally.agreeing[i]:
         return unplaced(f"only {inliers} of its {count} sightings agree, which may be chance; flash it again, alone")
+    if share < _FITS and (share < _FITS_NOT or tally.agreeing_stops[i] < _TRUSTED_STOPS):
+        return unplaced(f"only {100 * share:.0f} % of the survey's sightings fit together; see the map's notes")
     sigma = tally.sigma[i]
     if not sigma <= WIDEST_SIGMA_M:
         return unplaced(f"views nearly parallel (standard deviation {sigma:.2g} m); map it from a stop further aside")
@@ -267,11 +313,22 @@ def _ambiguous(
         candidates.append(Candidate(_vector(point), float(cost)))
     candidates.sort(key=lambda c: c.cost)
     distance = float(np.linalg.norm(np.subtract(candidates[0].position, candidates[1].position)))
+    theirs = [name for name in (_label_at(optimum, i, c.position) for c in candidates) if name is not None]
+    if theirs and reason is None:
+        reason = f"conflicting identities: some of its sightings are those of {theirs[0]}; flash both again, alone"
     reason = reason or (
         f"two positions {distance:.1f} m apart explain its sightings equally well (mirror solutions tied); "
         "map it from another stop"
     )
     return MappedLabel(label, "ambiguous", None, None, count, inliers, reason, tuple(candidates))
+
+
+def _label_at(optimum: Optimum, i: int, position: Vector3) -> str | None:
+    """Another label that hangs where this one's sightings point at."""
+    near = np.linalg.norm(optimum.state.points - position, axis=1) < _SAME_PLACE_M
+    near[i] = False
+    near &= np.isin(np.arange(len(near)), optimum.adjustment.labels)
+    return optimum.problem.labels[int(np.argmax(near))] if near.any() else None
 
 
 def _stops(optimum: Optimum) -> tuple[MappedStop, ...]:

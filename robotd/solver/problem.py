@@ -22,6 +22,7 @@ from ..errors import InputError, SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
 from ..records import Floats, Matrix3, Survey
+from ..survey_checks import Problems, check_units
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -233,7 +234,9 @@ def build_problem(survey: Survey) -> Problem:
 
 def _check(survey: Survey) -> Columns:
     """Raise InputError if the survey contradicts itself; returns its sightings as columns."""
-    problems: list[str] = []
+    doubts = Problems(f"survey {survey.survey}")
+    check_units(survey, doubts)
+    problems = doubts.found
     names = [camera.name for camera in survey.rig.cameras]
     roofs = {roof.name for roof in survey.roof_cameras}
     where = f"survey {survey.survey}"

@@ -22,7 +22,7 @@ from .problem import Bools, Ints, Known, Problem, State, anchors, stops_per_labe
 
 OUTLIER = 20.0  # squared whitened residual, 2 degrees of freedom: one right sighting in 20 000 exceeds it
 _SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
-_SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # what a slipped move still says: one wheel spun for some centimetres
+SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # what a slipped move still says: one wheel spun for some centimetres
 _WRONG_KNOWN = 25.0
 _REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tell them apart, slack on the lens
 _EXPLAINED = 0.25  # weight of a sighting under that loss from which it counts as explained
@@ -268,7 +268,7 @@ def _without_wrong(problem: Problem, state: State) -> Problem:
     moves, known, notes = problem.moves, problem.known, list(problem.notes)
     slipped = (linear.move**2).sum(axis=1) > _SLIP
     if slipped.any():
-        covariance_ = np.where(slipped[:, None, None], moves.covariance + _SLIPPED, moves.covariance)
+        covariance_ = np.where(slipped[:, None, None], moves.covariance + SLIPPED, moves.covariance)
         moves = replace(moves, covariance=covariance_)
         for m in np.flatnonzero(slipped):
             stop = problem.survey.stops[moves.after[m]]
