@@ -132,7 +132,7 @@ def drive(poses, arc, index, world: World, rng) -> list[Move]:
                     [-1.0 / WHEEL_BASE, 1.0 / WHEEL_BASE],
                 ]
             )
-            P = F @ P @ F.T + G @ G.T * WHEEL_NOISE**2 * ds[k]
+            P = F @ P @ F.T + G @ G.T * max(world.wheel, WHEEL_NOISE) ** 2 * ds[k]
             pose += [travel[k] * c, travel[k] * s, turn[k]]
         moves.append(Move(pose[0], pose[1], wrap_angle(pose[2]), covariance(P)))
     return moves
@@ -191,7 +191,7 @@ def simulate(store, seed=0, world: World = World(), outliers=0.0):
     where, normals = (np.array([label[key] for label in store["labels"]]) for key in ("position", "normal"))
     images = mirror_images(store, where, spoiler)
     reflected = spoiler.random(len(ids)) < world.reflections
-    stops, odometry = [], np.zeros(3)
+    stops, odometry, sigma = [], np.zeros(3), max(world.centroid_px, 0.1)
     for k, pose in enumerate(poses[index]):
         T_world_robot = pose_matrix(*pose, *rng.normal(0.0, world.tilt, 2))
         sightings = []
@@ -217,7 +217,7 @@ def simulate(store, seed=0, world: World = World(), outliers=0.0):
                             continue
                     elif dice < outliers or spoiler.random() < world.wrong_ids:
                         name = ids[spoiler.integers(len(ids))]
-                    sightings.append(Sighting(camera.name, name, float(place[0]), float(place[1]), 0.1, 0.99))
+                    sightings.append(Sighting(camera.name, name, float(place[0]), float(place[1]), sigma, 0.99))
         move = moves[k - 1] if k else None
         if move is not None:
             odometry = se2_compose(odometry, [move.dx, move.dy, move.dheading])
@@ -231,7 +231,7 @@ def simulate(store, seed=0, world: World = World(), outliers=0.0):
         world.odometry,
         world.odometry,
     )
-    survey = Survey("test", rig, tuple(stops), sigmas=Sigmas(0.1, 1.0), priors=priors)
+    survey = Survey("test", rig, tuple(stops), sigmas=Sigmas(sigma, 1.0), priors=priors)
     return survey, in_axes_of(poses[index[0]], dict(zip(ids, where, strict=True)))
 
 

@@ -1,4 +1,4 @@
-"""From survey to map, and the bundle adjustment alone against Ceres and scipy on the same problems.
+"""From survey to map, and the bundle adjustment alone against Ceres, GTSAM and scipy on the same problems.
 
 All are timed in CPU seconds on one thread, from the same start to a cost within 1e-4 of the tight optimum, analysis of
 the problem's structure included; `python -m tests.bench.solver` prints these alone, 8000 stops and memory included.
@@ -24,7 +24,7 @@ from robotd.solver.bundle import SQUARE, Adjustment
 from robotd.solver.kernel import compiled
 from robotd.solver.problem import State
 
-from . import ceres, stores
+from . import ceres, gtsam, stores
 from .table import Row, median_ms
 
 SURVEY = Path(__file__).parent / "room.survey.json"
@@ -66,6 +66,9 @@ def against(size: str, repeats: int) -> list[Row]:
         if abs(its / tight - 1.0) > 1e-4:
             raise RuntimeError(f"Ceres ended at cost {its}, the product at {tight}: not the same optimum")
         result.append(Row(what, ours(adjustment, start, tight, repeats), "Ceres", 1e3 * seconds))
+    if len(store.poses) <= 100 and gtsam.module() is not None:
+        theirs = min(gtsam.seconds(adjustment, start, tight) for _ in range(repeats))
+        result.append(Row(what, ours(adjustment, start, tight, repeats), "GTSAM", 1e3 * theirs))
     if len(store.poses) <= 100:
         result.append(
             Row(what, ours(adjustment, start, tight, repeats), "scipy", 1e3 * _scipy(adjustment, start, tight))
