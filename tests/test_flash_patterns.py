@@ -1,11 +1,14 @@
 """Patterns learnt from a film, the thesis's detector, reflections, and a camera that shakes."""
 
+import tomllib
+
 import numpy as np
 import pytest
 
+from robotd.bind import bind
 from robotd.errors import InputError
 from robotd.vision.blink import FlashConfig, FlashDetector, FlashPattern
-from robotd.vision.learn_pattern import learn_pattern
+from robotd.vision.learn_pattern import learn_pattern, learn_trace
 from robotd.vision.mirror import Lamp, reflected
 from robotd.vision.shake import Shake, kernels
 from robotd.vision.thesis_blink import ThesisFlashConfig, ThesisFlashDetector, cost, periods_of
@@ -17,12 +20,86 @@ from tests.flashes.world import light_of, shelves
 SMALL = (192, 144)
 
 
-def test_a_pattern_is_learnt_from_one_label():
-    for period, on in ((1.0, [(0.0, 0.1), (0.2, 0.3)]), (1.2, [(0.0, 0.1), (0.2, 0.3), (0.4, 0.5)])):
-        film, stamps = frames(scene(1, 0, Options(FlashPattern(period, on), SMALL, seconds=8.0, crowd=0.0)))
-        learnt = learn_pattern(film, stamps)
-        assert learnt.period == pytest.approx(period, abs=0.003)
-        assert np.allclose(learnt.on, on, atol=0.03)
+PATTERNS = (
+    FlashPattern(),
+    FlashPattern(1.0, [(0.0, 0.1), (0.2, 0.3)]),
+    FlashPattern(1.2, [(0.0, 0.1), (0.2, 0.3), (0.4, 0.5), (0.6, 0.7)]),
+    FlashPattern(1.0, [(0.0, 0.03), (0.2, 0.23), (0.4, 0.43)]),
+    FlashPattern(2.0, [(0.0, 0.2)]),
+)
+
+
+def light_curve(pattern, seconds=10.0, fps=30.0, noise=0.05, seed=0, lit=(0.0, np.inf)):
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, seconds, 1.0 / fps) + rng.uniform(0.0, 1.0)
+    since = times - rng.uniform(0.0, pattern.period)
+    share = np.where((times > lit[0]) & (times < lit[1]), pattern.coverage(since % pattern.period, 0.01, 2), 0.0)
+    return times + np.clip(rng.normal(0.0, 0.001, len(times)), -0.004, 0.004), share + noise * rng.normal(
+        size=len(times)
+    )
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_pattern_is_learnt_from_a_light_curve_to_its_stated_uncertainty(pattern, seed):
+    learnt = learn_trace(*light_curve(pattern, seed=seed))
+    assert learnt.confidence > 0.99
+    assert learnt.pattern.period == pytest.approx(pattern.period, abs=0.004)
+    assert len(learnt.pattern.on) == len(pattern.on)
+    assert learnt.edge_sigma < 0.012
+    # a frame's dark gap of 23 ms hides every edge of a pattern that repeats with whole frames
+    assert np.abs(np.array(learnt.pattern.on) - pattern.on).max() < 4.0 * learnt.edge_sigma
+
+
+def test_the_dark_before_and_after_the_flashes_does_not_matter():
+    learnt = learn_trace(*light_curve(FlashPattern(), 14.0, seed=3, lit=(4.0, 10.0)))
+    assert learnt.pattern.period == pytest.approx(1.0, abs=0.01)
+    assert len(learnt.pattern.on) == 3
+    assert 5 <= learnt.cycles <= 7
+
+
+def test_what_was_learnt_is_a_setting():
+    learnt = learn_trace(*light_curve(FlashPattern(), seed=1))
+    settings = tomllib.loads(learnt.toml())
+    assert bind(FlashPattern, settings["pattern"], "robotd.toml [mission.identify] pattern") == FlashPattern(
+        round(learnt.pattern.period, 5), tuple((round(a, 4), round(b, 4)) for a, b in learnt.pattern.on)
+    )
+
+
+def test_a_pattern_that_changes_half_way_is_refused():
+    before, after = light_curve(PATTERNS[0], 6.0), light_curve(PATTERNS[1], 6.0)
+    times = np.concatenate([before[0], before[0][-1] + 1 / 30 + after[0] - after[0][0]])
+    with pytest.raises(InputError, match=r"contradicts itself|does not repeat|not as flashes"):
+        learn_trace(times, np.concatenate([before[1], after[1]]))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_has_no_pattern(seed):
+    rng = np.random.default_rng(seed)
+    with pytest.raises(InputError):
+        learn_trace(np.arange(300) / 30.0, rng.normal(size=300))
+
+
+def test_a_pattern_is_learnt_from_a_film_of_one_label():
+    options = Options(PATTERNS[2], SMALL, seconds=8.0, crowd=0.0)
+    shown = scene(1, 0, options)
+    film, stamps = frames(shown)
+    learnt = learn_pattern(film, stamps)
+    assert learnt.pattern.period == pytest.approx(1.2, abs=0.004)
+    assert np.allclose(learnt.pattern.on, PATTERNS[2].on, atol=4.0 * learnt.edge_sigma)
+    assert np.hypot(learnt.u - shown.labels[0].u, learnt.v - shown.labels[0].v) < 3.0
+
+
+def test_two_lights_that_flash_differently_are_named_and_one_can_be_chosen():
+    rng = np.random.default_rng(0)
+    times = np.arange(0.0, 6.0, 1 / 30)
+    film = rng.normal(90.0, 1.5, (len(times), 96, 128))
+    for pattern, row, column in ((PATTERNS[0], 30, 40), (PATTERNS[1], 60, 90)):
+        film[:, row : row + 3, column : column + 3] += 60.0 * pattern.coverage(times % 1.0, 0.01, 2)[:, None, None]
+    film = film.astype(np.uint8)
+    with pytest.raises(InputError, match=r"two things flash differently: . flashes in 1\.\d+ s at pixel"):
+        learn_pattern(film, times)
+    assert len(learn_pattern(film, times, near=(91.0, 61.0)).pattern.on) == 2
 
 
 def test_nothing_is_learnt_where_nothing_repeats():

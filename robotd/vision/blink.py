@@ -47,7 +47,9 @@ Indices = NDArray[np.intp]
 _RING = 96  # frames kept; at 328x248 cells of 2 bytes 15.6 MB
 _FEW = 4  # frames since the last decision that are not worth another one
 _BLOCK = 32  # frames whose alternation fits into 16 bits: 32 * 63 * 63 / 4 < 2^15
-_BLOCK_LIMIT = 1500
+_LOW, _HIGH = 4.0, 1500.0  # a block's alternation counts no further than so many typical ones below, and this above
+_CLEAR = 1.8  # limits from which a place is clear enough to be examined at every decision
+_FORGET = 0.8  # of a place's refusals, from one decision to the next
 _TILE = (24, 32)  # cells over which the false alarm rate is held constant
 _BEFORE, _AFTER = 3, 5  # cells around an aperture's first one that its ring needs: 8x8 in all
 _LONGER = 2.5  # a slow camera's light curves are so much longer than `window_s`, because they have fewer frames
@@ -68,14 +70,14 @@ class FlashConfig:
     exposure_s: float = ranged(0.010, minimum=0.0, maximum=0.2, doc="exposure time of the camera")
     row_time_s: float = ranged(0.0, minimum=0.0, maximum=0.001, doc="time from one row's exposure to the next one's")
     gamma: float = ranged(2.2, minimum=0.3, maximum=4.0, doc="grey = light^(1/gamma); 1 for a linear camera")
-    min_alternation: float = ranged(5.5, minimum=1.0, doc="step 2: standard deviations above the neighbourhood")
+    min_alternation: float = ranged(3.0, minimum=1.0, doc="step 2: standard deviations above the neighbourhood")
     false_alarms_per_hour: float = ranged(1.0, minimum=1e-6, maximum=1e6, doc="step 3: of noise alone, at most")
     min_margin: float = ranged(5.0, minimum=0.0, doc="step 3: log-likelihood ratio against steady blinking")
     max_width_px: float = ranged(2.5, minimum=0.5, doc="a light is no wider (sigma) than this")
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
     steady_hz: tuple[float, ...] = (1.0, 2.0, 5.0, 8.0, 10.0)
     max_candidates: int = ranged(96, minimum=1, maximum=2000, doc="apertures examined at one decision")
-    max_reflection: float = ranged(0.7, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
+    max_reflection: float = ranged(0.65, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
 
     def min_score(self, shape: tuple[int, int]) -> float:
         """Log-likelihood ratio from which a light is accepted in images of this shape (H, W)."""
@@ -131,7 +133,7 @@ class FlashDetector:
         self._shifts = np.zeros((_RING, 2))
         self._shift_sum = np.zeros(2)  # places are given where they are in the mean picture
         self._shake = Shake(_BEFORE)
-        self._blocks: deque[tuple[int, NDArray[np.int16]]] = deque()
+        self._blocks: deque[tuple[int, NDArray[np.int16], NDArray[np.int16]]] = deque()
         self._count = 0
         self._block_frames = 0
         self._due = -np.inf
@@ -259,6 +261,8 @@ class FlashDetector:
         self._differences = np.zeros((depth, *shape), np.int8)
         self._total = np.zeros(shape, np.int16)
         self._window = np.zeros(shape, np.int32)  # sum of the blocks
+        self._clipped = np.zeros(shape, np.int32)  # the same, each limited
+        self._refused = np.zeros(shape, np.float32)  # how often a place was examined in vain, of late
         self._due = t + self.config.decision_s
 
     def _accumulate(self, frame: NDArray[np.uint8], t: float) -> None:
@@ -310,12 +314,18 @@ class FlashDetector:
     # ---- each decision -----------------------------------------------------------------------------------------------
 
     def _decide(self, t: float) -> None:
-        self._blocks.append((self._block_frames, self._total))
+        # because who passes by weighs more in one block than a label in all others
+        usual = float(np.median(np.abs(self._total[1::4, 1::4]))) + 1.0
+        clipped = np.clip(self._total, np.int16(-min(_LOW * usual, _HIGH)), np.int16(_HIGH))
+        self._blocks.append((self._block_frames, self._total, clipped))
         self._window += self._total
+        self._clipped += clipped
         self._total = np.zeros_like(self._total)
         self._block_frames = 0
-        while sum(count for count, _ in self._blocks) * self._pace() > self._window_s() + self.config.decision_s:
-            self._window -= self._blocks.popleft()[1]
+        while sum(block[0] for block in self._blocks) * self._pace() > self._window_s() + self.config.decision_s:
+            _, gone, clipped = self._blocks.popleft()
+            self._window -= gone
+            self._clipped -= clipped
         if t - self._times[0][1] < 1.4 * self.config.pattern.period:
             return
         rows, columns = self._candidates()
@@ -327,8 +337,9 @@ class FlashDetector:
         numbers, times = self._recent()
         values, levels = self._curves(numbers, rows, columns)
         matches = self._matcher.match(times, values, levels, self._shifts[numbers % _RING])
+        least = self.config.min_score((2 * self._total.shape[0], 2 * self._total.shape[1]))
         accepted = (
-            (matches.score >= self.config.min_score((2 * self._total.shape[0], 2 * self._total.shape[1])))
+            (matches.score >= least)
             & (matches.margin >= self.config.min_margin)
             & matches.regular
             & (matches.light > 0.0)
@@ -336,6 +347,8 @@ class FlashDetector:
         for k in range(known):
             if accepted[k]:
                 self._extend(self.tracks[k], k, matches, t)
+        in_vain = np.flatnonzero(matches.score[known:] < 0.5 * least) + known
+        self._refused[rows[in_vain], columns[in_vain]] += 1.0
         fresh = [k for k in np.argsort(-matches.light) if k >= known and accepted[k]]
         for k in fresh:
             self._add(int(rows[k]), int(columns[k]), int(k), matches, t)
@@ -349,29 +362,35 @@ class FlashDetector:
 
     def _candidates(self) -> tuple[Indices, Indices]:
         """Apertures whose alternation stands out, strongest first."""
-        clipped = np.zeros(self._window.shape, np.float32)
-        for _, block in self._blocks:  # because who passes by weighs more in one block than a label in all others
-            clipped += np.clip(block, -_BLOCK_LIMIT, _BLOCK_LIMIT)
-        total = self._window.astype(np.float32)
-        stands_out = (total > self._limit(total)) | (clipped > self._limit(clipped))
-        over = np.where(stands_out, np.maximum(total, clipped), np.float32(0.0))
-        width = total.shape[1]
+        total, clipped = self._window.astype(np.float32), self._clipped.astype(np.float32)
+        over = np.maximum(total / self._limit(total), clipped / self._limit(clipped))
         over[-1] = over[:, -1] = 0.0
         for track in self.tracks:
             over[
                 max(track.row - _SEPARATION, 0) : track.row + _SEPARATION + 1,
                 max(track.column - _SEPARATION, 0) : track.column + _SEPARATION + 1,
             ] = 0.0
-        peaks = np.flatnonzero((over > 0.0) & (over >= cv2.dilate(over, np.ones((3, 3), np.uint8))))
-        flat = over.ravel()
-        peaks = peaks[np.argsort(-flat[peaks], kind="stable")][: self.config.max_candidates]
-        rows, columns = np.divmod(peaks, width)
+        strength = np.maximum(total, clipped)
+        clear = self._peaks(np.where(over > _CLEAR, strength, np.float32(0.0)), 2 * self.config.max_candidates // 3)
+        # what is weaker, or found no room among the strong, has its turn before what was examined in vain
+        over *= over > 1.0
+        over /= 1.0 + self._refused
+        over.ravel()[clear] = 0.0
+        self._refused *= _FORGET
+        peaks = np.concatenate([clear, self._peaks(over, self.config.max_candidates - len(clear))])
+        rows, columns = np.divmod(peaks, total.shape[1])
         return np.ascontiguousarray(rows), np.ascontiguousarray(columns)
+
+    @staticmethod
+    def _peaks(image: Singles, most: int) -> Indices:
+        """Flat indices of the highest local maxima, highest first."""
+        peaks = np.flatnonzero((image > 0.0) & (image >= cv2.dilate(image, np.ones((3, 3), np.uint8))))
+        return peaks[np.argsort(-image.ravel()[peaks], kind="stable")][:most]
 
     def _limit(self, total: Singles) -> Singles:
         """What the alternation of every aperture must pass: its tile's median and so many spreads more."""
         height, width = total.shape
-        frames = sum(count for count, _ in self._blocks)
+        frames = sum(block[0] for block in self._blocks)
         tiles = max(1, height // _TILE[0]), max(1, width // _TILE[1])
         size = height // tiles[0], width // tiles[1]
         blocks = total[: tiles[0] * size[0], : tiles[1] * size[1]].reshape(tiles[0], size[0], tiles[1], size[1])

@@ -1,14 +1,18 @@
-"""Learn the pattern in which a label flashes, from a recording of one label that flashes all the time.
+"""Learn the pattern in which a label flashes, from a recording of one label that flashes for some periods.
 
-The label is the place whose light changes most like something that repeats: candidates are the cells that vary, each
-one's light curve is folded at every possible period, and the fold that explains most of the curve's energy, at the
-shortest period that does as well as its multiples, gives the period. The folded curve is then two levels, with edges
-where it crosses the middle; edges are blurred by the exposure, whose length must therefore be known.
+The label is where light changes most, compared with its surroundings. Its light curve is trimmed to the time in which
+it flashes and folded at every possible period; the shortest period whose fold leaves no more of the curve than its
+multiples' folds leave is the pattern's. Every edge of the folded curve is then the middle of the interval in which the
+exposures allow it, by a robust likelihood, and half that interval is its uncertainty.
+
+What was learnt is doubted before it is believed: rivals with a flash less, with two flashes in one, and with another
+period must be unlikely, and both halves of the recording must say the same; else the answer is a refusal that says why.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -23,10 +27,41 @@ Floats = NDArray[np.float64]
 
 _PLACES = 24  # that vary most, examined
 _APART = 3  # cells
-_GRID = 1.0 / 8.0  # of the resolution that the recording's length gives: step of the periods tried
-_AS_GOOD = 0.8  # share of the best fold's explained energy at which a shorter period is preferred
-_LEAST_EXPLAINED = 0.7
-_SHORTEST_S = 0.008  # on or off; shorter is noise in the fold
+_LEAST_CYCLES = 3
+_LEAST_CONTRAST = 4.0  # of a flash over the noise of one frame
+_NO_WORSE = 1.3  # a shorter period's fold may leave so much more than the best one's
+_LEAST_EXPLAINED = 0.7  # of the energy, by the fold; and by the pattern
+_CLIP = 4.0  # spreads at which a residual says that somebody stood before the label
+_SURE = 0.95  # confidence below which the answer is a refusal
+_RIVAL = 0.3  # a second place that flashes differently counts if it is so strong, relative to the first
+_ROUNDS = 2
+_ALLOWED = 4.0  # loss above the best one's, in squared spreads, that an edge or the period may have
+_STAMPS_S = 0.002  # time stamps are off by so much
+_HUGE = 1e12
+
+
+@dataclass(frozen=True, slots=True)
+class LearntPattern:
+    """A pattern, and how sure it is.
+
+    `confidence` is the posterior probability against rival patterns; `period_sigma` and `edge_sigma` (s) are the
+    standard deviations of the period and of the least certain edge; `cycles` periods were seen, of which the pattern
+    explains the share `explained` of the light curve's energy; `u`, `v` (px) is where, nan for a bare light curve.
+    """
+
+    pattern: FlashPattern
+    confidence: float
+    period_sigma: float
+    edge_sigma: float
+    explained: float
+    cycles: int
+    u: float = float("nan")
+    v: float = float("nan")
+
+    def toml(self) -> str:
+        """The line for [mission.identify] of robotd.toml."""
+        on = ", ".join(f"[{start:.4f}, {end:.4f}]" for start, end in self.pattern.on)
+        return f"pattern = {{ period = {self.pattern.period:.5f}, on = [{on}] }}"
 
 
 def learn_pattern(
@@ -36,62 +71,116 @@ def learn_pattern(
     gamma: float = 2.2,
     shortest: float = 0.2,
     longest: float = 3.0,
-) -> FlashPattern:
+    near: tuple[float, float] | None = None,
+) -> LearntPattern:
     """The pattern of the one label that flashes in a recording.
 
     Parameters
     ----------
     frames : iterable of (H, W) uint8 arrays
-        Grey images of a camera that stands still; a handful of periods or more, at 20 frames a second or more.
+        Grey images of a camera that stands still, 20 a second or more, over at least three periods of the pattern; the
+        label may be dark before and after.
     times : (F,) sequence
         Start of each frame's exposure in seconds, increasing.
     exposure, gamma : float
         Of the camera: seconds, and grey = light^(1/gamma).
     shortest, longest : float
         Limits of the period in seconds.
+    near : (u, v), optional
+        Only what flashes within 12 px of this pixel counts, where other things blink too.
 
     Returns
     -------
-    FlashPattern
+    LearntPattern
         Its first flash starts at 0, and its longest dark interval is the last.
 
     Raises
     ------
     InputError
-        If the recording is too short, or nothing in it repeats.
+        If the recording is too short, nothing in it repeats, several things flash differently, or the pattern is in
+        doubt; the message says which, and what to do.
     """
-    stamps = np.asarray(times, float)
-    if len(stamps) < 16 or stamps[-1] - stamps[0] < 3.0 * shortest:
-        raise InputError(
-            f"the recording has {len(stamps)} frames; expected at least 3 periods of one flashing label: record longer"
-        )
+    stamps = _checked(times, shortest)
     cells = np.stack([cv2.resize(f, (f.shape[1] // 2, f.shape[0] // 2), interpolation=cv2.INTER_AREA) for f in frames])
     if len(cells) != len(stamps):
         raise InputError(f"the recording has {len(cells)} frames but {len(stamps)} time stamps; expected as many")
-    curves = _curves(cells, light_table(gamma, 256))
-    longest = min(longest, (stamps[-1] - stamps[0]) / 3.0)
-    best: tuple[float, float, Floats] | None = None
-    for curve in curves:
-        period, explained = _period(stamps, curve, shortest, longest)
-        weight = explained * float(np.std(curve))
-        if explained >= _LEAST_EXPLAINED and (best is None or weight > best[0]):
-            best = weight, period, curve
-    if best is None:
+    found: list[tuple[float, LearntPattern]] = []
+    reasons: list[str] = []
+    for row, column, curve in _curves(cells, light_table(gamma, 256), near):
+        try:
+            learnt, light = _learn(stamps, curve, exposure, shortest, longest)
+        except InputError as error:
+            reasons.append(str(error))
+            continue
+        found.append((light, replace(learnt, u=2.0 * column + 1.5, v=2.0 * row + 1.5)))
+    if not found:
+        why = f" (the strongest place: {reasons[0]})" if reasons else ""
         raise InputError(
             "nothing in the recording flashes in a pattern that repeats: let one label flash all the time, keep people"
-            " out of the picture, and hold the camera still"
+            f" out of the picture, and hold the camera still{why}"
         )
-    return _pattern(stamps, best[2], best[1], exposure)
+    found.sort(key=lambda item: -item[0])
+    light, best = found[0]
+    for other, rival in found[1:]:
+        if other >= _RIVAL * light and not _same(best, rival):
+            raise InputError(
+                f"two things flash differently: {_said(best)} at pixel ({best.u:.0f}, {best.v:.0f}), {_said(rival)} at"
+                f" ({rival.u:.0f}, {rival.v:.0f}); cover one, or say near which pixel the label is"
+            )
+    return best
 
 
-def _curves(cells: NDArray[Any], light: NDArray[np.float32]) -> list[Floats]:
-    """Light curves of the 2x2-cell places that vary most, less the cells around."""
+def learn_trace(
+    times: Sequence[float] | Floats,
+    light: Sequence[float] | Floats,
+    exposure: float = 0.010,
+    shortest: float = 0.2,
+    longest: float = 3.0,
+) -> LearntPattern:
+    """The pattern of a light curve (F,) in any linear unit of light; else as `learn_pattern`."""
+    stamps = _checked(times, shortest)
+    curve = np.asarray(light, float)
+    if curve.shape != stamps.shape or not np.isfinite(curve).all():
+        raise InputError(f"expected one finite value of light for each of {len(stamps)} times, got {curve.shape}")
+    return _learn(stamps, curve, exposure, shortest, longest)[0]
+
+
+def _checked(times: Sequence[float] | Floats, shortest: float) -> Floats:
+    stamps = np.asarray(times, float)
+    if len(stamps) < 16 or stamps[-1] - stamps[0] < _LEAST_CYCLES * shortest:
+        raise InputError(
+            f"the recording has {len(stamps)} frames; expected at least 3 periods of one flashing label: record longer"
+        )
+    if np.min(np.diff(stamps)) <= 0.0:
+        raise InputError("the recording's time stamps do not increase")
+    return stamps
+
+
+def _said(learnt: LearntPattern) -> str:
+    return f"{len(learnt.pattern.on)} flashes in {learnt.pattern.period:.3f} s"
+
+
+def _same(a: LearntPattern, b: LearntPattern) -> bool:
+    """Whether two patterns differ by no more than their uncertainty and a few milliseconds allow."""
+    if len(a.pattern.on) != len(b.pattern.on) or abs(a.pattern.period - b.pattern.period) > 0.01 * a.pattern.period:
+        return False
+    allowed = 0.015 + 3.0 * float(np.hypot(a.edge_sigma, b.edge_sigma))
+    return bool(np.abs(np.array(a.pattern.on) - np.array(b.pattern.on)).max() <= allowed)
+
+
+def _curves(
+    cells: NDArray[Any], light: NDArray[np.float32], near: tuple[float, float] | None
+) -> list[tuple[int, int, Floats]]:
+    """Row, column and light curve, less the cells around, of the 2x2-cell places that vary most."""
     change = np.zeros(cells.shape[1:], np.float32)
     means = cells.mean(axis=(1, 2))
     for k in range(1, len(cells)):  # less the flicker of the lamps
         change += (cells[k].astype(np.float32) * np.float32(means[k - 1] / max(means[k], 1.0)) - cells[k - 1]) ** 2
     sums = cv2.boxFilter(change, -1, (2, 2), normalize=False, anchor=(0, 0))
     sums[-1] = sums[:, -1] = 0.0
+    if near is not None:
+        rows, columns = np.mgrid[: sums.shape[0], : sums.shape[1]]
+        sums[np.hypot(2.0 * columns + 1.5 - near[0], 2.0 * rows + 1.5 - near[1]) > 12.0] = 0.0
     curves = []
     for _ in range(_PLACES):
         row, column = divmod(int(np.argmax(sums)), sums.shape[1])
@@ -103,143 +192,256 @@ def _curves(cells: NDArray[Any], light: NDArray[np.float32]) -> list[Floats]:
         place = light[cells[:, row : row + 2, column : column + 2]].mean(axis=(1, 2))
         around = np.median(around, axis=(1, 2))
         # because lamps that flicker change the place and its surroundings by the same factor
-        curves.append((place - around * (np.median(place) / max(float(np.median(around)), 1e-3))).astype(float))
+        curve = place - around * (np.median(place) / max(float(np.median(around)), 1e-3))
+        curves.append((row, column, curve.astype(float)))
     return curves
 
 
-def _period(times: Floats, curve: Floats, shortest: float, longest: float) -> tuple[float, float]:
-    """The period whose fold explains most, and the share of the energy that it explains."""
-    y = curve - curve.mean()
-    seconds = float(times[-1] - times[0])
-    pace = seconds / (len(times) - 1)
-    # steps of the period so small that the last fold moves by a fraction of a frame
-    rates = np.arange(1.0 / longest, 1.0 / shortest, _GRID * 4.0 * pace / (seconds * shortest) * 0.5)
-    explained = np.array([_explained(times, y, 1.0 / rate, pace) for rate in rates])
-    good = np.flatnonzero(explained >= _AS_GOOD * explained.max())
-    first = good[-1]  # of the shortest period
-    near = np.abs(rates - rates[first]) < 3.0 * pace / (seconds * shortest)
-    peak = int(np.argmax(np.where(near, explained, -np.inf)))
-    rate = rates[peak]
-    for step in (0.25 * pace / (seconds * shortest), 0.05 * pace / (seconds * shortest)):
-        fine = rate + step * np.arange(-6, 7)
-        scores = np.array([_explained(times, y, 1.0 / r, pace) for r in fine])
-        top = np.flatnonzero(scores >= scores.max() - 0.01 * abs(scores.max()))
-        rate = float(fine[top].mean())  # because the fold's bins make a plateau
-    return 1.0 / rate, float(_explained(times, y, 1.0 / rate, pace))
+def _learn(
+    times: Floats, curve: Floats, exposure: float, shortest: float, longest: float
+) -> tuple[LearntPattern, float]:
+    """The pattern, and how bright it is; raises `InputError` with the reason why there is none."""
+    times, curve = _active(times, curve)
+    whole = _Fit(times, curve, exposure, shortest, longest)
+    learnt = whole.learnt()
+    light = whole.light
+    middle = len(times) // 2
+    if learnt.cycles >= 2 * _LEAST_CYCLES:
+        for part in (slice(None, middle), slice(middle, None)):
+            half = _Fit(times[part], curve[part], exposure, shortest, longest, whole.period).learnt()
+            if not _same(learnt, half):
+                raise InputError(
+                    f"the recording contradicts itself: {_said(learnt)} in all of it, {_said(half)} in one half; keep"
+                    " people and other lights away from the label"
+                )
+    if learnt.confidence < _SURE:
+        raise InputError(
+            f"the pattern is in doubt: {_said(learnt)}, with a probability of {learnt.confidence:.0%} only; record"
+            " longer, from nearer"
+        )
+    return learnt, light
 
 
-def _explained(times: Floats, y: Floats, period: float, pace: float) -> float:
-    """Share of the energy of y that its mean over the phases of a period explains, less what chance gives it."""
+def _active(times: Floats, curve: Floats) -> tuple[Floats, Floats]:
+    """The part of a light curve in which the label flashes."""
+    noise = float(np.quantile(np.abs(np.diff(curve)), 0.25)) / 0.45  # most frames change by noise alone
+    dark = float(np.quantile(curve, 0.1)) + 1.28 * noise
+    raised = curve - dark
+    top = raised > max(_LEAST_CONTRAST * noise, 0.5 * float(np.quantile(raised, 0.99)))
+    lit = np.flatnonzero(top)
+    if len(lit) < 2 * _LEAST_CYCLES:
+        raise InputError("no flashes stand out of the noise; record from nearer, in less light")
+    pace = float(np.median(np.diff(times)))
+    chosen = (times >= times[lit[0]] - 1.5 * pace) & (times <= times[lit[-1]] + 1.5 * pace)
+    return times[chosen], curve[chosen]
+
+
+class _Fit:
+    """One light curve, its period and its edges."""
+
+    def __init__(
+        self, times: Floats, curve: Floats, exposure: float, shortest: float, longest: float, period: float = 0.0
+    ) -> None:
+        if len(times) < 12:
+            raise InputError("the label flashes in too few frames; record longer")
+        self.times, self.curve = times, curve
+        self.exposure = max(exposure, 1e-4)
+        self.seconds = float(times[-1] - times[0])
+        self.pace = self.seconds / (len(times) - 1)
+        self.period = period or self._find_period(shortest, min(longest, self.seconds / (_LEAST_CYCLES - 0.8)))
+        self.on = self._flashes()
+        self.period_sigma = self.edge_sigma = 0.0
+        self.dark = self.light = 0.0
+        self.noise = float(np.std(curve))
+        for _ in range(_ROUNDS if not period else 1):
+            self._refine()
+            self._divide()
+
+    # ---- period ------------------------------------------------------------------------------------------------------
+
+    def _find_period(self, shortest: float, longest: float) -> float:
+        """The shortest period whose fold leaves about as little as the best one's."""
+        if longest <= shortest:
+            raise InputError("the label flashes for less than 3 periods; record longer")
+        y = self.curve - self.curve.mean()
+        step = 0.25 * self.pace / (self.seconds * shortest)  # the last fold moves by a fraction of a frame
+        rates = np.arange(1.0 / longest, 1.0 / shortest, step)
+        left = np.array([_left(self.times, y, 1.0 / rate, self.pace) for rate in rates])
+        best = int(np.argmin(left))
+        if left[best] > 1.0 - _LEAST_EXPLAINED:
+            raise InputError("its light does not repeat")
+        chosen = rates[best], left[best]
+        for divisor in range(12, 0, -1):
+            near = np.flatnonzero(np.abs(rates - divisor * rates[best]) <= 2.0 * divisor * step)
+            if len(near) and left[near].min() <= _NO_WORSE * left[best] + 0.01:
+                k = near[np.argmin(left[near])]
+                chosen = rates[k], left[k]
+                break
+        rate = float(chosen[0])
+        for part in (0.3, 0.08):
+            fine = rate + part * step * np.arange(-6, 7)
+            scores = np.array([_left(self.times, y, 1.0 / r, self.pace) for r in fine])
+            rate = float(fine[scores <= scores.min() + 0.01].mean())  # because the fold's bins make a plateau
+        return 1.0 / rate
+
+    # ---- edges -------------------------------------------------------------------------------------------------------
+
+    def _flashes(self) -> list[list[float]]:
+        """First guess [start, end] of every flash: where the folded curve is in its upper half."""
+        phase = (self.times + 0.5 * self.exposure) % self.period
+        order = np.argsort(phase)
+        phase, values = phase[order], self.curve[order]
+        reach = 0.5 * min(self.pace, self.period / 12.0)
+        folded = np.array(
+            [
+                np.median(values[np.abs((phase - p + 0.5 * self.period) % self.period - 0.5 * self.period) <= reach])
+                for p in phase
+            ]
+        )
+        dark, lit = np.quantile(folded, [0.1, 0.97])
+        on = folded > 0.5 * (dark + lit)
+        rises = np.flatnonzero(on & ~np.roll(on, 1))
+        falls = np.flatnonzero(~on & np.roll(on, 1))
+        if not len(rises):
+            raise InputError("the label is never dark: expected flashes with dark intervals between them")
+        flashes = []
+        for k in rises:
+            start = 0.5 * (phase[k] + phase[k - 1] - (self.period if k == 0 else 0.0))
+            after = falls[np.argmin((phase[falls] - phase[k]) % self.period)]
+            end = 0.5 * (phase[after] + phase[after - 1] - (self.period if after == 0 else 0.0))
+            flashes.append([float(start), float(start + (end - start) % self.period)])
+        return flashes
+
+    def _share(self, on: list[list[float]], period: float) -> Floats:
+        """Share of each exposure in which the light is on; phases are kept at the recording's middle."""
+        middle = 0.5 * (self.times[0] + self.times[-1])
+        since = self.times - middle + (middle % self.period)
+        total = np.zeros(len(self.times))
+        for start, end in on:
+            lag = (since - start + self.exposure) % period - self.exposure
+            for turn in (0.0, period):
+                total += np.clip(np.minimum(lag + self.exposure, turn + end - start) - np.maximum(lag, turn), 0.0, None)
+        return np.minimum(total / self.exposure, 1.0)
+
+    def _loss(self, on: list[list[float]], period: float) -> float:
+        """Sum of squared residuals in units of the noise, each limited, with the best dark and light."""
+        share = self._share(on, period)
+        weights = np.ones(len(share))
+        residual = self.curve
+        for _ in range(2):
+            w = weights.sum()
+            mx, my = weights @ share / w, weights @ self.curve / w
+            self.light = float(weights @ ((share - mx) * (self.curve - my)) / max(weights @ (share - mx) ** 2, 1e-12))
+            self.dark = float(my - self.light * mx)
+            residual = self.curve - self.dark - self.light * share
+            weights = 1.0 / (1.0 + (residual / (_CLIP * self.noise)) ** 2)
+        return float(np.minimum((residual / self.noise) ** 2, _CLIP**2).sum()) if self.light > 0.0 else _HUGE
+
+    def _divide(self) -> None:
+        """Take a fraction of the period if the flashes repeat within it."""
+        starts = np.sort([start % self.period for start, _ in self.on])
+        lengths = np.array([end - start for start, end in self.on])[np.argsort([s % self.period for s, _ in self.on])]
+        tolerance = 0.6 * self.pace + self.exposure
+        for divisor in range(len(starts), 1, -1):
+            if len(starts) % divisor or self.period / divisor < 2.0 * self.pace:
+                continue
+            count = len(starts) // divisor
+            later = np.roll(starts, -count) + np.where(np.arange(len(starts)) >= len(starts) - count, self.period, 0.0)
+            apart = np.abs(later - starts - self.period / divisor).max()
+            if apart <= tolerance and np.abs(np.roll(lengths, -count) - lengths).max() <= 2.0 * tolerance:
+                middle = 0.5 * (self.times[0] + self.times[-1])
+                shift = middle % (self.period / divisor) - middle % self.period
+                self.period /= divisor
+                chosen = sorted(self.on, key=lambda flash: flash[0] % (self.period * divisor))[:count]
+                self.on = [[start + shift, end + shift] for start, end in chosen]
+                self._refine()
+                return
+
+    def _refine(self) -> None:
+        """Move the period and every edge to the middle of what the exposures allow."""
+        residual = self._residual()
+        floor = 0.01 * max(self.light, 1e-9)
+        self.noise = max(1.48 * float(np.median(np.abs(residual))), floor)
+        spans = np.linspace(-1.0, 1.0, 33)
+        step = 0.5 * self.pace / self.seconds * self.period
+        trials = self.period + step * spans
+        losses = np.array([self._loss(self.on, float(trial)) for trial in trials])
+        allowed = trials[losses <= losses.min() + _ALLOWED]
+        middle = 0.5 * (self.times[0] + self.times[-1])
+        period = float(allowed.mean())
+        shift = middle % period - middle % self.period  # so that the middle keeps its phase
+        self.on = [[start + shift, end + shift] for start, end in self.on]
+        self.period, self.period_sigma = period, float(np.hypot(allowed.std(), (trials[1] - trials[0]) / 3.5))
+        worst = 0.0
+        reach = 0.6 * self.pace + self.exposure
+        for flash in self.on:
+            for side in (0, 1):
+                trials = flash[side] + reach * spans
+                trials = trials[trials < flash[1] - 0.004] if side == 0 else trials[trials > flash[0] + 0.004]
+                tried: list[float] = []
+                for trial in trials:
+                    keep, flash[side] = flash[side], float(trial)
+                    tried.append(self._loss(self.on, self.period))
+                    flash[side] = keep
+                allowed = trials[np.array(tried) <= min(tried) + _ALLOWED]
+                flash[side] = float(allowed.mean())
+                worst = max(worst, float(np.hypot(allowed.std(), (trials[1] - trials[0]) / 3.5)))
+        self.edge_sigma = float(np.hypot(worst, _STAMPS_S))
+
+    def _residual(self) -> Floats:
+        self._loss(self.on, self.period)
+        return self.curve - self.dark - self.light * self._share(self.on, self.period)
+
+    # ---- doubts ------------------------------------------------------------------------------------------------------
+
+    def learnt(self) -> LearntPattern:
+        """The pattern, and the posterior probability of it among its rivals."""
+        residual = self._residual()
+        self.noise = max(1.48 * float(np.median(np.abs(residual))), 0.02 * max(self.light, 1e-9))
+        best = self._loss(self.on, self.period)
+        energy = np.minimum((self.curve - np.median(self.curve)) ** 2, (2.0 * max(self.light, 1e-9)) ** 2)
+        left = np.minimum(residual**2, (2.0 * max(self.light, 1e-9)) ** 2)
+        explained = 1.0 - float(left.sum() / max(energy.sum(), 1e-12))
+        if self.light < _LEAST_CONTRAST * self.noise or explained < _LEAST_EXPLAINED:
+            raise InputError("its light repeats, but not as flashes of one brightness")
+        light, losses = self.light, [self._loss(on, self.period) for on in self._rivals()]
+        self.light = light
+        simpler = np.log(len(self.times))  # Schwarz's criterion, for the two edges that a rival does without
+        odds = sum(np.exp(np.clip(0.5 * (best - loss) + simpler, -60.0, 60.0)) for loss in losses)
+        on = sorted(self.on, key=lambda flash: flash[0] % self.period)
+        gaps = [(b[0] - a[1]) % self.period for a, b in zip(on, on[1:] + on[:1], strict=True)]
+        first = (int(np.argmax(gaps)) + 1) % len(on)
+        on = on[first:] + on[:first]
+        since = [((start - on[0][0]) % self.period, end - start) for start, end in on]
+        try:
+            pattern = FlashPattern(self.period, tuple((round(s, 5), round(s + length, 5)) for s, length in since))
+        except ValueError as error:
+            raise InputError(f"its flashes overlap: {error}") from error
+        cycles = int(np.ceil(self.seconds / self.period - 0.1))
+        if cycles < _LEAST_CYCLES:
+            raise InputError(f"the label flashes for {cycles} periods of {self.period:.2f} s; expected 3 or more")
+        return LearntPattern(pattern, 1.0 / (1.0 + float(odds)), self.period_sigma, self.edge_sigma, explained, cycles)
+
+    def _rivals(self) -> list[list[list[float]]]:
+        """Patterns that are simpler by one flash: without it, or together with its neighbour."""
+        on = sorted(self.on)
+        if len(on) == 1:
+            return []
+        fewer = [on[:k] + on[k + 1 :] for k in range(len(on))]
+        merged = [[*on[:k], [on[k][0], on[k + 1][1]], *on[k + 2 :]] for k in range(len(on) - 1)]
+        return fewer + merged
+
+
+def _left(times: Floats, y: Floats, period: float, pace: float) -> float:
+    """Share of the energy of y that its mean over the phases of a period leaves, corrected for the bins' number."""
     bins = max(6, int(period / pace))
-    best = 0.0
+    best = 1.0
     for offset in (0.0, 0.5):  # because frames may fall on the borders of one set of bins, and scatter over them
         index = ((times % period) * (bins / period) + offset).astype(int) % bins
         count = np.bincount(index, minlength=bins)
-        sums = np.bincount(index, y, bins)
         used = int((count > 0).sum())
         if len(y) - used >= 4:
-            share = float((sums**2 / np.maximum(count, 1)).sum() / max(float(y @ y), 1e-12))
-            best = max(best, 1.0 - (1.0 - share) * (len(y) - 1) / (len(y) - used))
+            sums = np.bincount(index, y, bins)
+            left = 1.0 - float((sums**2 / np.maximum(count, 1)).sum() / max(float(y @ y), 1e-12))
+            best = min(best, left * (len(y) - 1) / (len(y) - used))
     return best
-
-
-def _pattern(times: Floats, curve: Floats, period: float, exposure: float) -> FlashPattern:
-    """Edges of the folded curve: rises and falls that, blurred by the exposure, fit it best."""
-    phase = (times + 0.5 * exposure) % period
-    order = np.argsort(phase)
-    phase, values = phase[order], curve[order]
-    window = max(3, len(values) // max(40, int(period / 0.02))) | 1
-    wrapped = np.concatenate([values[-window:], values, values[:window]])
-    smooth = np.array(
-        [np.median(wrapped[k + window // 2 + 1 : k + window // 2 + 1 + window]) for k in range(len(values))]
-    )
-    dark, lit = np.percentile(smooth, [5, 100])
-    top = smooth > 0.5 * (dark + lit)
-    dark, lit = float(np.median(values[~top])), float(np.median(values[top & (smooth > 0.8 * lit + 0.2 * dark)]))
-    on = smooth > 0.5 * (dark + lit)
-    turns = np.flatnonzero(on != np.roll(on, 1))
-    if len(turns) < 2:
-        raise InputError("the label in the recording is never dark: expected flashes with dark intervals between them")
-    edges = [(_crossing(phase, smooth, int(k), period, 0.5 * (dark + lit)), bool(on[k])) for k in turns]
-    starts = [edge for edge, rising in edges if rising]
-    ends = [edge for edge, rising in edges if not rising]
-    flashes = []
-    for start in starts:
-        length = min((end - start) % period for end in ends)
-        if length >= _SHORTEST_S:
-            flashes.append((start, length))
-    if not flashes:
-        raise InputError("no flash in the recording is longer than 8 ms; expected a label that flashes")
-    flashes.sort()
-    for _ in range(2):
-        flashes = [_fitted(times, curve, period, exposure, flash, dark, lit) for flash in flashes]
-        period, flashes = _paced(times, (curve - dark) / (lit - dark), period, exposure, flashes)
-    gaps = [
-        (following[0] - start - length) % period
-        for (start, length), following in zip(flashes, flashes[1:] + flashes[:1], strict=True)
-    ]
-    first = (int(np.argmax(gaps)) + 1) % len(flashes)
-    flashes = flashes[first:] + flashes[:first]
-    origin = flashes[0][0]
-    return FlashPattern(
-        float(period),
-        tuple(((start - origin) % period, (start - origin) % period + length) for start, length in flashes),
-    )
-
-
-def _crossing(phase: Floats, values: Floats, k: int, period: float, middle: float) -> float:
-    """Phase at which the folded curve crosses the middle between its samples k - 1 and k."""
-    before = phase[k - 1] - (period if k == 0 else 0.0)
-    share = np.clip((middle - values[k - 1]) / (values[k] - values[k - 1] + 1e-12), 0.0, 1.0)
-    return float(before + share * (phase[k] - before))
-
-
-def _paced(
-    times: Floats, y: Floats, period: float, exposure: float, flashes: list[tuple[float, float]]
-) -> tuple[float, list[tuple[float, float]]]:
-    """Refine the period, and with it where the flashes are in it, by least absolute deviations."""
-    middle, seconds = 0.5 * float(times[0] + times[-1]), float(times[-1] - times[0])
-    lengths = [length for _, length in flashes]
-    # the recording's middle keeps its phase, so that period and phase are found one after the other
-    since = [(start - middle) % period for start, _ in flashes]
-    step = 0.03 * period / seconds
-
-    def lit(trial: float) -> Floats:
-        model = np.zeros(len(times))
-        for start, length in zip(since, lengths, strict=True):
-            lag = (times - middle - start + 0.5 * trial) % trial - 0.5 * trial
-            model += np.clip(np.minimum(lag + exposure, length) - np.maximum(lag, 0.0), 0.0, None) / exposure
-        return model
-
-    for _ in range(4):
-        trials = period + step * np.arange(-4, 5)
-        losses = np.array([np.abs(y - lit(float(trial))).sum() for trial in trials])
-        period = float(trials[np.flatnonzero(losses <= losses.min() * 1.002)].mean())
-        step *= 0.4
-    return period, [((middle + start) % period, length) for start, length in zip(since, lengths, strict=True)]
-
-
-def _fitted(
-    times: Floats, curve: Floats, period: float, exposure: float, flash: tuple[float, float], dark: float, lit: float
-) -> tuple[float, float]:
-    """Start and length of one flash by least squares against the exposures near it."""
-    start, length = flash
-    y = (curve - dark) / (lit - dark)
-    since = (times - start + 0.5 * period) % period - 0.5 * period
-    reach = 1.5 * exposure + 0.02
-    step = 0.25 * exposure + 0.004
-    for _ in range(5):
-        best = np.inf, start, length
-        for first in start + step * np.arange(-2, 3):
-            for last in start + length + step * np.arange(-2, 3):
-                if last - first < _SHORTEST_S:
-                    continue
-                lag = since - (first - flash[0])
-                near = (since > -reach) & (since < flash[1] + reach)
-                model = np.clip(np.minimum(lag + exposure, last - first) - np.maximum(lag, 0.0), 0.0, None) / exposure
-                loss = float(np.abs(y[near] - model[near]).sum())
-                if loss < best[0]:
-                    best = loss, float(first), float(last - first)
-        _, start, length = best
-        step *= 0.5
-    return start, length

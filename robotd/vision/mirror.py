@@ -18,7 +18,10 @@ Floats = NDArray[np.float64]
 _PRIOR, _MOST = 0.1, 0.5  # fraction of lights that are reflections: at first, and at most
 _WEIGHT = 8.0  # lights that the first guess of that fraction counts for
 _ROUNDS = 4
+_CROWDED = 1.6  # log-odds against a lamp's further reflection, for each that it has
 _STAMPS_S = 0.0015  # what time stamps and rows leave uncertain between two places of a picture
+_LOOK_S = 0.0005  # no look is surer
+_DISPROOF = 6.0  # squared spreads beyond which a difference speaks against one lamp by itself
 _COARSE_S = 0.015  # starts known no better than so tell nothing: at 10 frames a second every tenth pair would agree
 _LOSS = (-0.9, 0.8)  # mean and standard deviation of log(reflected light / direct light)
 _LABELS = 1.3  # standard deviation of log(light) between labels, times the square root of 2
@@ -57,10 +60,14 @@ def reflected(lamps: Sequence[Lamp], period: float) -> Floats:
     probability = np.zeros(count)
     for _ in range(_ROUNDS):
         probability = np.zeros(count)
+        shares = np.zeros((count, count))  # [i, j]: probability that i reflects j
         for i in np.argsort([_directness(lamp) for lamp in lamps]):
-            # a reflection has no reflections: odds of what was found to be one already count less
-            total = float(odds[i] @ (1.0 - probability)) / max(count - 1, 1) * prior / (1.0 - prior)
-            probability[i] = total / (1.0 + total)
+            # a reflection has no reflections, and few lamps have several: what has some is less likely to have one more
+            others = shares.sum(axis=0) - shares[i]
+            parts = odds[i] * (1.0 - probability) * np.exp(-_CROWDED * others)
+            parts *= prior / (1.0 - prior) / max(count - 1, 1)
+            shares[i] = parts / (1.0 + parts.sum())
+            probability[i] = shares[i].sum()
         prior = float(np.clip((probability.sum() + _WEIGHT * _PRIOR) / (count + _WEIGHT), 0.02, _MOST))
     return probability
 
@@ -72,19 +79,27 @@ def _directness(lamp: Lamp) -> float:
 
 
 def _together(a: Lamp, b: Lamp, period: float) -> float:
-    """Log-likelihood ratio of the starts: the same, against any."""
-    best = None
+    """Log-likelihood ratio of the starts: the same at every time, against any.
+
+    The differences at all times at which both were looked at are averaged, but their uncertainty does not shrink by
+    it, because starts that fall between the same two exposures look the same every time.
+    """
+    weight, mean, least = 0.0, 0.0, np.inf
+    apart = []
     for t, start, sigma in a.starts:
         near = b.starts[np.argmin(np.abs(b.starts[:, 0] - t))]
-        if abs(near[0] - t) > 1.5 * period:
-            continue
-        apart = (start - near[1] + 0.5 * period) % period - 0.5 * period
-        variance = sigma**2 + near[2] ** 2 + _STAMPS_S**2
-        if variance > _COARSE_S**2:
-            continue
-        ratio = -0.5 * apart**2 / variance + np.log(period / np.sqrt(2.0 * np.pi * variance))
-        best = ratio if best is None else min(best, ratio)  # because one epoch apart disproves it
-    return -np.inf if best is None else float(best)
+        variance = float(sigma**2 + near[2] ** 2) + _LOOK_S**2
+        if abs(near[0] - t) <= 1.5 * period and variance <= _COARSE_S**2:
+            difference = float((start - near[1] + 0.5 * period) % period - 0.5 * period)
+            apart.append(difference**2 / (variance + _STAMPS_S**2))
+            least = min(least, variance)
+            weight += 1.0 / variance
+            mean += difference / variance
+    if not apart:
+        return -np.inf
+    variance = least + _STAMPS_S**2
+    spread = max(0.0, max(apart) - _DISPROOF)  # because one time far apart disproves it
+    return float(-0.5 * (mean / weight) ** 2 / variance + np.log(period / np.sqrt(2.0 * np.pi * variance)) - spread)
 
 
 def _dimmed(a: Lamp, b: Lamp) -> float:

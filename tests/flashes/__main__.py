@@ -53,8 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if options.learn:
         film, stamps = frames(scene(1, 1000 + options.seed, Options(pattern=pattern, seconds=10.0, crowd=0.0)))
-        pattern = learn_pattern(film, stamps)
-        print(f"learnt: period {pattern.period:.4f} s, on {[(round(a, 3), round(b, 3)) for a, b in pattern.on]}")
+        learnt = learn_pattern(film, stamps)
+        pattern = learnt.pattern
+        sure = f"confidence {learnt.confidence:.4f}, edges to {1e3 * learnt.edge_sigma:.1f} ms"
+        print(f"learnt with {sure}: {learnt.toml()}")
     cuts = [*sorted(cut for cut in options.cuts if cut < options.seconds), options.seconds]
     scores = {cut: Score() for cut in cuts}
     for seed in range(options.seed, options.seed + options.sets):
