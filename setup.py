@@ -11,6 +11,7 @@ PACKAGES = [
     "robotd.ctl",
     "robotd.geometry",
     "robotd.operations",
+    "robotd.identify",
     "robotd.roomba",
     "robotd.server",
     "robotd.sim",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 from ..bind import ranged
 from ..clock import outside
-from ..errors import DriverFault, MissionError
+from ..errors import DriverFault
 from ..plugin import Driver
 
 AT_ONCE = 500  # labels in one request, the gateway's limit
@@ -45,7 +45,7 @@ class PricerDriver(Driver):
     config: PricerConfig
 
     async def open(self) -> None:
-        """Connect, and check that the gateway takes our token; raises DriverFault."""
+        """Connect, and check that the gateway takes our token and requests; raises DriverFault."""
         self._token = self._read_token()
         self._number = 0
         self._turn = asyncio.Lock()
@@ -53,38 +53,41 @@ class PricerDriver(Driver):
         self._broken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.resources.callback(self._disconnect)
         reply = await self._ask({"method": "status"})
-        if not reply.get("ok"):
-            raise self._fault(f"refuses: {reply.get('error', 'without a reason')}")
+        if (cause := _cause(reply)) is not None:
+            raise self._fault(f"refuses: {cause}")
 
     async def run(self) -> None:
         """Wait until a request fails; raises its DriverFault."""
         await self._broken
 
-    async def flash(self, labels: Sequence[str], strength: float, duration: float) -> None:
-        """Ask that `labels` flash for `duration` whole seconds at `strength` 0..1.
+    async def flash(self, labels: Sequence[str], strength: float, durations: Sequence[int]) -> Mapping[str, str]:
+        """Ask that `labels` flash, in this order, for their whole seconds of `durations`, at `strength` 0..1.
 
-        Returns when the request lies in the folder that the label system watches.
+        Returns when the request lies on the disk of the label system's server: the labels that were refused, each with
+        the reason.
 
         Raises
         ------
         DriverFault
-            The gateway is not reached.
-        MissionError
-            It refuses this request; the message says why.
+            The gateway is not reached, or takes no request at all: its queue is full, its folder cannot be written, or
+            the token is wrong. It is asked again when it says that this is mended.
         """
+        refused: dict[str, str] = {}
         for start in range(0, len(labels), AT_ONCE):
-            part = list(labels[start : start + AT_ONCE])
+            part = slice(start, start + AT_ONCE)
             key = uuid.uuid4().hex
-            request = {"method": "flash", "labels": part, "strength": strength, "duration": duration, "key": key}
+            request = {"method": "flash", "labels": list(labels[part]), "strength": strength, "key": key}
             try:
-                reply = await self._ask(request)
+                reply = await self._ask({**request, "duration": [int(length) for length in durations[part]]})
+                if (cause := _cause(reply)) is not None:
+                    raise self._fault(f"refuses: {cause}")
             except DriverFault as fault:
                 if not self._broken.done():
                     self._broken.set_exception(DriverFault(str(fault)))
                     self._broken.exception()  # it need not be fetched: the caller has its own
                 raise
-            if not reply.get("ok"):
-                raise MissionError(f"{self.name}: robotd-labels refuses: {reply.get('error', 'without a reason')}")
+            refused.update(reply.get("refused", {}))
+        return refused
 
     def _read_token(self) -> str | None:
         path = self.config.token_file
@@ -125,7 +128,11 @@ class PricerDriver(Driver):
             if not answer.endswith(b"\n"):
                 raise EOFError
             reply = json.loads(answer)
-            if not isinstance(reply, dict) or reply.get("id") != self._number:
+            if (
+                not isinstance(reply, dict)
+                or reply.get("id") != self._number
+                or not _is_table(reply.get("refused", {}))
+            ):
                 raise ValueError
         except ValueError as error:
             self._disconnect()
@@ -142,3 +149,14 @@ class PricerDriver(Driver):
 
     def _fault(self, what: str) -> DriverFault:
         return DriverFault(f"{self.name}: robotd-labels at {self.config.host}:{self.config.port} {what}")
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+
+
+def _cause(reply: Mapping[str, Any]) -> str | None:
+    """Why the gateway takes no request, or None if it does."""
+    if not reply.get("ok"):
+        return str(reply.get("error", "without a reason"))
+    return None if reply.get("trouble") is None else str(reply["trouble"])

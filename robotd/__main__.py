@@ -263,6 +263,7 @@ def run(path: Path, *, mission: bool) -> int:
     from .control_socket import ControlSocket
     from .daemon import Daemon, assemble
     from .operations import Operations
+    from .prompt import converse
     from .real import RealHardware
 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
@@ -274,9 +275,15 @@ def run(path: Path, *, mission: bool) -> int:
     async def until_told() -> None:
         control = ControlSocket(path.parent / assembly.config.robot.control, Operations(daemon))
         work = asyncio.ensure_future(daemon.run(mission=mission, control=control))
+        talk = None
+        if sys.stdin is not None and sys.stdin.isatty():
+            talk = asyncio.ensure_future(converse(assembly.bus, sys.stdin.fileno(), print))
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, work.cancel)
         await asyncio.gather(work, return_exceptions=True)
+        if talk is not None:
+            talk.cancel()
+            await asyncio.gather(talk, return_exceptions=True)
         if not work.cancelled():
             work.result()
 

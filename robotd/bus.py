@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 from .records import (
+    Answer,
     DriveCommand,
     Event,
     Frame,
@@ -17,6 +18,7 @@ from .records import (
     LineStatus,
     MissionStatus,
     OdometryState,
+    Prompt,
     SensorFrame,
     Withdrawal,
 )
@@ -104,6 +106,8 @@ class Bus:
         self.commands: Topic[DriveCommand] = Topic()  # from followers and operators, to the safety layer
         self.withdrawals: Topic[Withdrawal] = Topic()  # the same ones taking it back
         self.events: Topic[Event] = Topic()  # for the operator and the journal
+        self.prompts: Topic[Prompt] = Topic()  # from drivers that need a person, to whoever can show them
+        self.answers: Topic[Answer] = Topic()  # what the person says
         self.status: Topic[MissionStatus] = Topic()  # from the mission, at every change
         self.line_status: Topic[LineStatus] = Topic()  # from the follower
         self.line_motion: Topic[LineMotion] = Topic()  # the same, measured by the line alone

@@ -40,6 +40,19 @@ class RobotConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class Zone:
+    """[[mission.zones]]: these labels can be seen only between two distances along the line, in metres."""
+
+    labels: tuple[str, ...]
+    begin: float
+    end: float
+
+    def __post_init__(self) -> None:
+        if self.end < self.begin:
+            raise ValueError(f"end = {self.end:g}; expected at least begin = {self.begin:g}")
+
+
+@dataclass(frozen=True, slots=True)
 class MissionConfig:
     """[mission]
 
@@ -59,6 +72,7 @@ class MissionConfig:
     marker_stops: int = ranged(0, minimum=0, maximum=10000)
     mains_hz: Literal[50, 60] = 50
     camera_groups: tuple[tuple[str, ...], ...] = ()
+    zones: tuple[Zone, ...] = ()
 
     def __post_init__(self) -> None:
         if any(later <= earlier for earlier, later in zip(self.stops, self.stops[1:], strict=False)):
@@ -71,6 +85,10 @@ class MissionConfig:
         twice = sorted(label for label, count in counts.items() if count > 1)
         if twice:
             raise ValueError(f"labels: {', '.join(twice)} listed more than once; expected every id once")
+        zoned = Counter(label for zone in self.zones for label in zone.labels)
+        unknown = sorted(zoned.keys() - counts.keys())
+        if unknown:
+            raise ValueError(f"zones: {', '.join(unknown[:5])} not among labels; expected ids that are listed there")
         if not all(self.camera_groups):
             raise ValueError("camera_groups: found an empty group; expected names of cameras in each")
 

@@ -457,7 +457,7 @@ class Daemon:
                 Event(now(), "upload", "error", f"no map yet: {text}; the stops are kept and sent at the next start")
             )
             return
-        self.map = complete_map(solved, config.mission.labels, len(mission.stops), mission.ended)
+        self.map = complete_map(solved, config.mission.labels, len(mission.stops), mission.ended, mission.refused)
         await in_thread(_write, self.state / "map.json", map_to_json(self.map))
 
     def _fault(self) -> str | None:

@@ -3,15 +3,18 @@
 The label system (thesis section 6.3.6) scans a folder of text files every few seconds and says nothing back. This
 program runs beside it, also on Windows, as this one file. It speaks JSON over TCP, one object a line:
 
-    {"id": 1, "token": "...", "method": "flash", "labels": ["4711"], "duration": 3, "strength": 1.0, "key": "a1b2"}
-    {"id": 1, "ok": true}                          the instruction file is in the folder
-    {"id": 1, "ok": false, "error": "..."}         it is not; the text says why
-    {"id": 2, "token": "...", "method": "status"}  answered by {"id": 2, "ok": true, "waiting": 0}
+    {"id": 1, "token": "...", "method": "flash", "labels": ["4", "7"], "duration": [3, 5], "strength": 1.0, "key": "a"}
+    {"id": 1, "ok": true, "refused": {}}           the request lies on the disk and goes into the folder, by itself
+    {"id": 1, "ok": false, "error": "..."}         nothing of it will; the text says why
+    {"id": 2, "token": "...", "method": "status"}  answered by {"id": 2, "ok": true, "waiting": 0, "trouble": null}
+
+`duration` is one number of seconds for all labels or a list with one for each. A label that cannot be asked is left out
+and named in `refused` with the reason; the others are asked. `trouble` is why a flash would be refused at present.
 
 A request that carries a `key` (any text, unique) may be sent again after a lost connection: it is obeyed once. The
 order on the disk makes that hold through a crash: the file is written under a working name, then noted in the log with
-its key, then renamed into the folder. At a start, files that are noted are renamed and the others, which nobody was
-told about, are deleted.
+its key, then renamed into the folder, with a guard time not before so long after the one before it. At a start, files
+that are noted are renamed and the others, which nobody was told about, are deleted. Files go in the order of requests.
 """
 
 from __future__ import annotations
@@ -20,12 +23,14 @@ import argparse
 import asyncio
 import hmac
 import json
+import math
 import os
 import re
 import signal
 import string
 import sys
-from collections import OrderedDict
+import time
+from collections import OrderedDict, deque
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -39,6 +44,8 @@ WAITING_LIMIT = 1000  # instruction files that the label system has not fetched
 CLIENT_LIMIT = 32  # connections
 LOG_LIMIT = 4 << 20  # bytes; then the log is put aside as log.1
 KEYS = 10_000  # keys remembered
+RETRY_S = 1.0  # between two looks at files that cannot be moved
+TRIES, PAUSE_S = 5, 0.02  # of a rename that Windows refuses while a virus scanner looks at the file
 _FILE = re.compile(r"robotd-(\d{12})\.txt")
 
 
@@ -55,10 +62,15 @@ class Outbox:
         The one that the label system watches.
     template : str
         One line of an instruction file, in Python's format syntax, with label, duration (s) and strength (0..1).
+    guard_s : float
+        Time between two files at least; 0: each goes into the folder at once.
     """
 
-    def __init__(self, folder: Path, template: str = TEMPLATE) -> None:
+    def __init__(self, folder: Path, template: str = TEMPLATE, guard_s: float = 0.0) -> None:
         self.folder = folder
+        self.guard_s = guard_s
+        self.held: deque[str] = deque()  # names of files that wait for their guard time
+        self._latest = -math.inf  # when the latest file went into the folder, in the caller's clock
         self.work = folder / ".robotd-labels"
         self.log = self.work / "log"
         self.template = template
@@ -71,43 +83,82 @@ class Outbox:
         self.work.mkdir(exist_ok=True)
         noted = set()
         for entry in self._entries():
-            noted.add(entry["file"])
-            self._remember(entry.get("key"))
+            if entry.get("withdrawn"):
+                noted.discard(entry["file"])
+                self.keys.pop(str(entry.get("key")), None)
+            else:
+                noted.add(entry["file"])
+                self._remember(entry.get("key"))
         for path in sorted(self.work.glob("robotd-*.txt")):
             if path.name in noted:
-                os.replace(path, self.folder / path.name)
+                self.held.append(path.name)
             else:
                 path.unlink()
         names = [*noted, *(path.name for path in self.folder.iterdir())]
         self.number = max((int(match[1]) for name in names if (match := _FILE.fullmatch(name))), default=0)
+        if not self.guard_s:
+            self.release(0.0)
 
-    def flash(self, labels: list[str], duration: int, strength: float, key: str | None, sender: str) -> None:
-        """Put one instruction file into the folder; raises RefusedError."""
+    def flash(
+        self, labels: list[str], durations: list[int], strength: float, key: str | None, sender: str, now: float = 0.0
+    ) -> None:
+        """Take one instruction file, and release what is due at time `now`; raises RefusedError."""
         if key is not None and key in self.keys:
             return
-        if (waiting := self.waiting()) >= WAITING_LIMIT:
-            raise RefusedError(
-                f"{waiting} instruction files wait in {self.folder}; is the label system running and watching it?"
-            )
-        lines = [self.template.format(label=label, duration=duration, strength=strength) + "\n" for label in labels]
+        if (trouble := self.trouble()) is not None:
+            raise RefusedError(trouble)
+        lines = [
+            self.template.format(label=label, duration=duration, strength=strength) + "\n"
+            for label, duration in zip(labels, durations, strict=True)
+        ]
         name = f"robotd-{self.number + 1:012d}.txt"
         path = self.work / name
         try:
             _write(path, "wb", "".join(lines).encode())
             date = path.stat().st_mtime
             entry = {"file": name, "date": date, "key": key, "sender": sender}
-            self._note({**entry, "labels": labels, "duration": duration, "strength": strength})
+            self._note({**entry, "labels": labels, "duration": durations, "strength": strength})
             self.number += 1
-            os.replace(path, self.folder / name)
+            self.held.append(name)
+            self.release(now)
         except OSError as error:
+            if name in self.held:
+                self.held.remove(name)
             with suppress(OSError):
-                path.unlink()  # a restart must not obey what is refused now
+                path.unlink()  # a restart must not obey what is refused now,
+                self._note({"file": name, "key": key, "withdrawn": True})  # nor take it for done if it is asked again
             raise RefusedError(f"{self.folder} cannot be written: {error.strerror or error}") from error
         self._remember(key)
 
+    def release(self, now: float) -> float | None:
+        """Move files whose guard time is over into the folder; seconds until the next one is due, None if none waits.
+
+        Raises OSError if one cannot be moved; it waits on.
+        """
+        while self.held:
+            due = self._latest + self.guard_s - now
+            if due > 0.0:
+                return due
+            _rename(self.work / self.held[0], self.folder / self.held[0])
+            self.held.popleft()
+            self._latest = now
+        return None
+
     def waiting(self) -> int:
         """How many of our files the label system has not fetched yet."""
-        return sum(1 for name in os.listdir(self.folder) if _FILE.fullmatch(name))
+        return len(self.held) + sum(1 for name in os.listdir(self.folder) if _FILE.fullmatch(name))
+
+    def trouble(self) -> str | None:
+        """Why no flash can be taken at present."""
+        try:
+            waiting = self.waiting()
+        except OSError as error:
+            return f"{self.folder} cannot be read: {error.strerror or error}"
+        if waiting >= WAITING_LIMIT:
+            return f"{waiting} instruction files wait in {self.folder}; is the label system running and watching it?"
+        if not os.access(self.folder, os.W_OK) or not os.access(self.work, os.W_OK):
+            return f"{self.folder} cannot be written; give this program's user the right to"
+        return None
 
     def _note(self, entry: dict[str, Any]) -> None:
         with suppress(FileNotFoundError):
@@ -151,9 +202,11 @@ class Gateway:
         self.outbox = outbox
         self.token = token
         self.clients: set[asyncio.Task[None]] = set()
+        self.held = asyncio.Event()  # a file waits for its guard time
 
     async def serve(self, host: str, port: int) -> None:
         """Listen until cancelled; prints the address when it is ready."""
+        releasing = asyncio.create_task(self._release())
         server = await asyncio.start_server(self._connected, host, port, limit=LINE_LIMIT)
         address = server.sockets[0].getsockname()
         print(f"robotd-labels: listening on {address[0]}:{address[1]}", flush=True)
@@ -164,7 +217,21 @@ class Gateway:
                 for client in self.clients:
                     client.cancel()
         finally:
-            await asyncio.gather(*self.clients, return_exceptions=True)
+            releasing.cancel()
+            await asyncio.gather(*self.clients, releasing, return_exceptions=True)
+
+    async def _release(self) -> None:
+        """Let held files go when their time has come."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                due = self.outbox.release(loop.time())
+            except OSError as error:
+                print(f"robotd-labels: {self.outbox.folder}: {error.strerror or error}; tried again", file=sys.stderr)
+                due = None
+            self.held.clear()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self.held.wait(), RETRY_S if due is None else due)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -176,7 +243,9 @@ class Gateway:
                 writer.write(_answer(None, f"more than {CLIENT_LIMIT} connections; close one"))
                 return
             while line := await _line(reader):
-                writer.write(self.answer(line, sender))
+                writer.write(self.answer(line, sender, asyncio.get_running_loop().time()))
+                if self.outbox.held:
+                    self.held.set()
                 await writer.drain()
         except ValueError:  # asyncio's word for a line beyond the limit: where the next one begins is unknown
             writer.write(_answer(None, f"a line of more than {LINE_LIMIT} bytes; send less"))
@@ -188,8 +257,8 @@ class Gateway:
             with suppress(OSError, asyncio.CancelledError):
                 await writer.wait_closed()
 
-    def answer(self, line: bytes, sender: str = "?") -> bytes:
-        """The answer to one line, whatever is in it."""
+    def answer(self, line: bytes, sender: str = "?", now: float = 0.0) -> bytes:
+        """The answer to one line, whatever is in it; `now` in seconds of the clock that guard times are kept by."""
         number: Any = None
         try:
             try:
@@ -203,7 +272,7 @@ class Gateway:
                 number = None
                 raise RefusedError("id: expected a number or a text")
             self._check_token(request.pop("token", None))
-            return _answer(number, **self._obey(request, sender))
+            return _answer(number, **self._obey(request, sender, now))
         except RefusedError as error:
             return _answer(number, str(error))
 
@@ -215,35 +284,57 @@ class Gateway:
         ):
             raise RefusedError("token: missing or wrong; it is in the gateway's --token-file")
 
-    def _obey(self, request: dict[str, Any], sender: str) -> dict[str, Any]:
+    def _obey(self, request: dict[str, Any], sender: str, now: float) -> dict[str, Any]:
         method = request.pop("method", None)
         if method == "status":
             _check_keys(request, set(), set())
-            return {"waiting": self.outbox.waiting()}
+            trouble = self.outbox.trouble()
+            return {"waiting": self.outbox.waiting() if trouble is None else None, "trouble": trouble}
         if method != "flash":
             raise RefusedError(f"method: found {_quote(method)}; expected flash or status")
         _check_keys(request, {"labels", "duration"}, {"strength", "key"})
-        labels, duration = request["labels"], request["duration"]
-        strength, key = request.get("strength", 1.0), request.get("key")
+        labels, strength, key = request["labels"], request.get("strength", 1.0), request.get("key")
         if not isinstance(labels, list) or not 1 <= len(labels) <= LABEL_LIMIT:
             raise RefusedError(f"labels: expected a list of 1 to {LABEL_LIMIT} label ids")
-        for label in labels:
-            self._check_label(label)
-        if not _is_number(duration) or not 1 <= duration <= 255 or duration % 1 != 0:
-            raise RefusedError(f"duration: found {_quote(duration)}; expected whole seconds from 1 to 255")
+        durations = self._durations(request["duration"], len(labels))
         if not _is_number(strength) or not 0 < strength <= 1:
             raise RefusedError(f"strength: found {_quote(strength)}; expected above 0, at most 1")
         if key is not None and (not isinstance(key, str) or not 1 <= len(key) <= 100):
             raise RefusedError("key: expected a text of 1 to 100 characters")
-        self.outbox.flash(labels, int(duration), float(strength), key, sender)
-        return {}
+        refused = {}
+        asked: list[tuple[str, int]] = []
+        for label, duration in zip(labels, durations, strict=True):
+            if not isinstance(label, str):
+                raise RefusedError(f"labels: found {_quote(label)}; expected ids of 1 to 64 printable characters")
+            if (reason := self._flaw(label)) is not None:
+                refused[label] = reason
+            else:
+                asked.append((label, duration))
+        if asked:
+            self.outbox.flash(
+                [label for label, _ in asked], [length for _, length in asked], float(strength), key, sender, now
+            )
+        return {"refused": refused}
 
-    def _check_label(self, label: Any) -> None:
-        if not isinstance(label, str) or not 1 <= len(label) <= 64 or not label.isprintable():
-            raise RefusedError(f"labels: found {_quote(label)}; expected ids of 1 to 64 printable characters")
-        clash = sorted(set(label) & self.outbox.separators)
-        if clash:
-            raise RefusedError(f"labels: {_quote(label)} has {_quote(clash[0])}, which separates in instruction files")
+    @staticmethod
+    def _durations(given: Any, count: int) -> list[int]:
+        durations = given if isinstance(given, list) else [given] * count
+        if len(durations) != count:
+            raise RefusedError(
+                f"duration: found {len(durations)} of them; expected one, or one for each label ({count})"
+            )
+        for duration in durations:
+            if not _is_number(duration) or not 1 <= duration <= 255 or duration % 1 != 0:
+                raise RefusedError(f"duration: found {_quote(duration)}; expected whole seconds from 1 to 255")
+        return [int(duration) for duration in durations]
+
+    def _flaw(self, label: str) -> str | None:
+        """Why this label cannot be asked."""
+        if not 1 <= len(label) <= 64 or not label.isprintable():
+            return "expected an id of 1 to 64 printable characters"
+        if clash := sorted(set(label) & self.outbox.separators):
+            return f"it has {_quote(clash[0])}, which separates fields in instruction files"
+        return None
 
 
 async def _line(reader: asyncio.StreamReader) -> bytes:
@@ -316,6 +407,17 @@ def _write(path: Path, mode: str, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
+def _rename(old: Path, new: Path) -> None:
+    for left in reversed(range(TRIES)):
+        try:
+            os.replace(old, new)
+            return
+        except PermissionError:
+            if not left:
+                raise
+            time.sleep(PAUSE_S)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(
@@ -326,7 +428,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--port", type=int, default=0, help="port to listen on (default: a free one, which is printed)")
     parser.add_argument("--token-file", type=Path, help="file with the secret that requests must carry")
     parser.add_argument("--template", default=TEMPLATE, help=f"one line of an instruction file (default: {TEMPLATE})")
+    parser.add_argument("--guard", type=float, default=0.0, help="seconds between two instruction files (default: 0)")
     options = parser.parse_args(arguments)
+    if not 0.0 <= options.guard <= 3600.0:
+        parser.error(f"--guard {options.guard:g}: expected seconds from 0 to 3600")
     token = None
     if options.token_file is not None:
         try:
@@ -338,7 +443,7 @@ def main(arguments: list[str] | None = None) -> int:
     elif options.host not in ("127.0.0.1", "::1", "localhost"):
         parser.error(f"--host {options.host}: without --token-file only 127.0.0.1 may be served")
     try:
-        outbox = Outbox(options.folder, options.template)
+        outbox = Outbox(options.folder, options.template, options.guard)
     except (ValueError, IndexError, KeyError) as error:
         parser.error(f"--template '{options.template}': {error}; expected for example '{TEMPLATE}'")
     try:

@@ -27,7 +27,7 @@ from .clock import in_executor, in_thread, now
 from .config import Calibration, MissionConfig
 from .errors import DriverFault, MissionError
 from .hardware import CameraMode, Hardware
-from .identify import Identifier, Slot
+from .identify import DelayModel, FlashRequest, Identifier, LabelMemory, Slot
 from .journal import Journal
 from .odometry import Odometry
 from .plugin import Base, Camera, FollowEnd, Follower, Labels
@@ -123,6 +123,12 @@ class Mission:
         self._number = first_stop  # of the stop at hand
         self._by_hand = 0.0  # metres that were not driven along the line
         self._was_lifted = False  # since the last stop
+        self.undecided = 0  # lights of the present stop that got no name
+        self.refused: dict[str, str] = {}  # labels that the label system does not take, with its reason
+        identify = config.identify
+        zones = [(zone.labels, zone.begin, zone.end) for zone in config.zones]
+        self.memory = LabelMemory(config.labels, calibration.cameras, identify, zones)
+        self._delays = DelayModel(identify)
         self._workers: ThreadPoolExecutor | None = None
         self._groups = config.camera_groups or (tuple(cameras),)
 
@@ -232,7 +238,17 @@ class Mission:
     async def _look(self, group: Sequence[str]) -> tuple[Sighting, ...]:
         """What these cameras see in slots of their own."""
         mode = CameraMode(exposure=self.config.identify.exposure_s, mains_hz=self.config.mains_hz)
-        identifier = Identifier(self.config.labels, tuple(group), self.config.identify)
+        state = self.bus.odometry.latest
+        identifier = await in_thread(
+            Identifier,
+            self.config.labels,
+            tuple(group),
+            self.config.identify,
+            delays=self._delays,
+            memory=self.memory,
+            pose=None if state is None else state.pose,
+            travelled=self._along(),
+        )
         async with AsyncExitStack() as stack:
             for name in group:
                 frames = stack.enter_context(self.bus.frames(name).subscribe(size=8))
@@ -245,9 +261,20 @@ class Mission:
                     raise DriverFault(f"{name}: no frame for {FIRST_FRAME_S:g} s; check the camera") from None
                 watch = asyncio.create_task(self._watch(identifier, name, frames))
                 stack.push_async_callback(_cancel, watch)
-            while (slot := identifier.next_slot()) is not None:
+            while (slot := await in_thread(identifier.next_slot, now())) is not None:
                 await self._slot(identifier, slot)
-        return await in_thread(identifier.finish)
+        sightings = await in_thread(identifier.finish, now())
+        for label in identifier.mistaken:
+            text = f"{label} was named by its place, but flashed like another label; its place is learnt anew"
+            self.bus.events.publish(Event(now(), "mission", "warning", text))
+        self.undecided += identifier.undecided
+        return sightings
+
+    def _along(self) -> float:
+        """Metres along the line, counted as `stops` are."""
+        state = self.bus.odometry.latest
+        begin = self.config.stops[self.first_stop - 1] if self.config.stops and self.config.stop_at == "distances" else 0.0
+        return begin + (0.0 if state is None else state.travelled - self._by_hand)
 
     async def _watch(self, identifier: Identifier, camera: str, frames: Subscription[Frame]) -> None:
         async for frame in frames:
@@ -256,18 +283,37 @@ class Mission:
     async def _slot(self, identifier: Identifier, slot: Slot) -> None:
         started = now()
         identifier.begin(slot, started)
-        for request in slot.requests:
-            await self.labels.flash(request.labels, self.config.identify.strength, request.duration)
         self._status("observing", self._number, f"slot {slot.number + 1}")
-        while now() < started + slot.timeout and not identifier.is_complete(now()):
+        late = 0.0  # what handing the requests over took: with a person in between, that is what the slot waits for
+        for request in slot.requests:
+            await asyncio.sleep(started + request.after + late - now())
+            before = now()
+            await self._ask(request)
+            late += now() - before
+        while now() < started + late + slot.timeout and not identifier.is_complete(now() - late):
             await asyncio.sleep(0.1)
         await in_thread(self.journal.add_slot, self.config.survey, self.leg, self._number, slot.number, started, now())
+
+    async def _ask(self, request: FlashRequest) -> None:
+        """Pass a request on; labels that are refused are reported once and not asked again."""
+        refused = await self.labels.flash(request.labels, self.config.identify.strength, request.durations)
+        for label, reason in refused.items():
+            if label not in self.refused:
+                text = f"{self.labels.name}: {label} is refused and left out: {reason}"
+                self.bus.events.publish(Event(now(), "mission", "warning", text))
+            self.refused[label] = reason
+            self.memory.refused.add(label)
+        if refused and len(self.refused) == len(self.config.labels):
+            self.refused.clear()  # whoever mends that wants them asked again
+            self.memory.refused.clear()
+            raise MissionError(f"{self.labels.name}: every label is refused, the last one: {reason}")
 
     async def _record(self, number: int, sightings: Sequence[Sighting]) -> None:
         state = self.bus.odometry.latest
         move = None
         if self.stops and (self.odometry.broken_since_mark or self._was_lifted):
             self.leg = await in_thread(self.journal.begin_leg, self._header)
+            self.memory.forget_places()
             text = f"odometry was interrupted before stop {number}: leg {self.leg} begins there"
             self.bus.events.publish(Event(now(), "mission", "warning", text))
         elif self.stops:
@@ -287,6 +333,8 @@ class Mission:
         self.wake_upload()
         seen = len({sighting.label for sighting in sightings})
         text = f"stop {number} of {self._most_stops}: {seen} labels, {len(sightings)} sightings"
+        text += f", {self.undecided} lights undecided" if self.undecided else ""
+        self.undecided = 0
         self.bus.events.publish(Event(now(), "mission", "info", text))
 
     # ---- faults ------------------------------------------------------------------------------------------------------
@@ -380,7 +428,9 @@ class Mission:
         return self.hardware.utc().astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def complete_map(solved: Map, labels: Sequence[str], stops: int, ended: str | None) -> Map:
+def complete_map(
+    solved: Map, labels: Sequence[str], stops: int, ended: str | None, refused: Mapping[str, str] | None = None
+) -> Map:
     """Add the labels that no stop saw, each with its reason, so that the map speaks of every label asked for.
 
     Parameters
@@ -393,7 +443,10 @@ def complete_map(solved: Map, labels: Sequence[str], stops: int, ended: str | No
         Stops made.
     ended : str or None
         Why the mission ended early.
+    refused : mapping of str to str, optional
+        Labels that the label system did not take, with its reasons.
     """
+    reasons = {label: f"the label system refuses it: {why}; correct its id" for label, why in (refused or {}).items()}
     known = {entry.label for entry in solved.labels}
     if ended is None:
         reason = (
@@ -402,7 +455,9 @@ def complete_map(solved: Map, labels: Sequence[str], stops: int, ended: str | No
         )
     else:
         reason = f"not seen before the mission ended after {stops} stops ({ended})"
-    missing = [MappedLabel(label, "unplaced", reason=reason) for label in labels if label not in known]
+    missing = [
+        MappedLabel(label, "unplaced", reason=reasons.get(label, reason)) for label in labels if label not in known
+    ]
     notes = solved.notes if ended is None else (*solved.notes, f"the mission ended after {stops} stops: {ended}")
     return replace(solved, labels=(*solved.labels, *missing), notes=notes)
 

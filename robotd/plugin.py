@@ -9,7 +9,7 @@ supervisor halts the robot and opens it again. Any other exception is a bug and 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
@@ -109,11 +109,12 @@ class Labels(Protocol):
 
     name: str
 
-    async def flash(self, labels: Sequence[str], strength: float, duration: float) -> None:
-        """Ask that these labels flash for `duration` seconds (whole seconds) at `strength` 0..1.
+    async def flash(self, labels: Sequence[str], strength: float, durations: Sequence[int]) -> Mapping[str, str]:
+        """Ask that these labels flash, in this order, each for its whole seconds of `durations`, at `strength` 0..1.
 
-        Returns when the request was accepted for delivery. Raises DriverFault if the label system cannot be reached,
-        and MissionError if it refuses the request: asking again would not help.
+        Returns when the request was accepted for delivery, with the labels that it was not accepted for and why:
+        asking for those again would not help. Raises DriverFault if the label system cannot be reached or takes no
+        request at all, with what the operator can do about it.
         """
 
 

@@ -275,6 +275,26 @@ class LinePoints:
         self.travelled.flags.writeable = False
 
 
+@dataclass(frozen=True, slots=True)
+class Prompt:
+    """A driver asks a person to do something; `number` is unique among the source's prompts of one run."""
+
+    t: float
+    source: str
+    number: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a person answers to a prompt of `source`, in words that the prompt explains."""
+
+    t: float
+    source: str
+    number: int
+    text: str
+
+
 # ---- survey: what the robot brings home (robotd-survey/1) ------------------------------------------------------------
 
 

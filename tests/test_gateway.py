@@ -22,7 +22,7 @@ import robotd.gateway as gateway
 from robotd.bind import bind
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
-from robotd.errors import ConfigError, DriverFault, MissionError
+from robotd.errors import ConfigError, DriverFault
 from robotd.gateway import Gateway, Outbox, main
 from robotd.plugin import Labels
 
@@ -54,16 +54,18 @@ def files(folder):
 
 
 def test_a_flash_becomes_one_instruction_file(desk, tmp_path):
-    assert ask(desk, FLASH) == {"id": 1, "ok": True}
-    assert ask(desk, {**FLASH, "id": "x", "labels": ["C1"], "duration": 255, "strength": 0.5}) == {
-        "id": "x",
-        "ok": True,
-    }
+    assert ask(desk, FLASH) == {"id": 1, "ok": True, "refused": {}}
+    assert ask(desk, {**FLASH, "id": "x", "labels": ["C1"], "duration": 255, "strength": 0.5})["id"] == "x"
     assert files(tmp_path) == {
         "robotd-000000000001.txt": "FLASH;A17;3;1.0\nFLASH;B 2;3;1.0\n",
         "robotd-000000000002.txt": "FLASH;C1;255;0.5\n",
     }
-    assert ask(desk, {"id": 2, "token": TOKEN, "method": "status"}) == {"id": 2, "ok": True, "waiting": 2}
+    assert ask(desk, {"id": 2, "token": TOKEN, "method": "status"}) == {
+        "id": 2,
+        "ok": True,
+        "waiting": 2,
+        "trouble": None,
+    }
 
 
 @pytest.mark.parametrize(
@@ -78,11 +80,7 @@ def test_a_flash_becomes_one_instruction_file(desk, tmp_path):
         ({"labels": []}, "labels: expected a list of 1 to 500"),
         ({"labels": "A1"}, "labels: expected a list"),
         ({"labels": ["A1"] * 501}, "labels: expected a list of 1 to 500"),
-        ({"labels": ["A;1"]}, 'has ";", which separates'),
-        ({"labels": ["A\n1"]}, "printable"),
         ({"labels": [17]}, "labels: found 17"),
-        ({"labels": ["x" * 65]}, "1 to 64 printable"),
-        ({"labels": ["\ud800"]}, "printable"),
         ({"duration": 2.5}, "duration: found 2.5; expected whole seconds from 1 to 255"),
         ({"duration": 0}, "expected whole seconds from 1 to 255"),
         ({"duration": 256}, "expected whole seconds from 1 to 255"),
@@ -90,6 +88,8 @@ def test_a_flash_becomes_one_instruction_file(desk, tmp_path):
         ({"duration": float("nan")}, "expected whole seconds"),
         ({"duration": float("inf")}, "expected whole seconds"),
         ({"duration": "3"}, "expected whole seconds"),
+        ({"duration": [3]}, "duration: found 1 of them; expected one, or one for each label (2)"),
+        ({"duration": [3, 0]}, "found 0; expected whole seconds"),
         ({"strength": 0}, "strength: found 0; expected above 0, at most 1"),
         ({"strength": 1.1}, "strength"),
         ({"strength": float("nan")}, "strength"),
@@ -105,6 +105,78 @@ def test_bad_requests_are_refused_with_the_reason(desk, tmp_path, change, text):
     assert files(tmp_path) == {}
 
 
+def test_every_label_may_have_its_own_duration(desk, tmp_path):
+    assert ask(desk, {**FLASH, "duration": [2, 9]})["ok"]
+    assert list(files(tmp_path).values()) == ["FLASH;A17;2;1.0\nFLASH;B 2;9;1.0\n"]
+
+
+def test_labels_that_cannot_be_asked_are_named_and_the_others_are_asked(desk, tmp_path):
+    bad = {"A;1": 'it has ";"', "A\n1": "printable", "x" * 65: "1 to 64", "\ud800": "printable", "": "1 to 64"}
+    reply = ask(desk, {**FLASH, "labels": ["A1", *bad, "A2"], "duration": list(range(2, 9))})
+    assert reply["ok"]
+    assert reply["refused"].keys() == bad.keys()
+    assert all(text in reply["refused"][label] for label, text in bad.items())
+    assert list(files(tmp_path).values()) == ["FLASH;A1;2;1.0\nFLASH;A2;8;1.0\n"]
+    assert ask(desk, {**FLASH, "labels": ["A;1"]})["refused"]
+    assert len(files(tmp_path)) == 1
+
+
+def test_guard_times_hold_files_back_in_their_order_and_over_a_restart(tmp_path):
+    outbox = Outbox(tmp_path, guard_s=5.0)
+    outbox.open()
+    desk = Gateway(outbox, None)
+
+    def flash(label, now):
+        line = json.dumps({"method": "flash", "labels": [label], "duration": 3, "key": label}).encode()
+        assert json.loads(desk.answer(line, "me", now))["ok"]
+
+    flash("A1", 100.0)
+    flash("A2", 101.0)
+    flash("A3", 102.0)
+    assert [text[6:8] for text in files(tmp_path).values()] == ["A1"]
+    assert outbox.waiting() == 3
+    assert outbox.release(104.0) == 1.0
+    assert outbox.release(105.0) == 5.0
+    assert [text[6:8] for text in files(tmp_path).values()] == ["A1", "A2"]
+    again = Outbox(tmp_path, guard_s=5.0)
+    again.open()
+    assert again.release(7.0) is None
+    assert [text[6:8] for text in files(tmp_path).values()] == ["A1", "A2", "A3"]
+    again.flash(["A3"], [3], 1.0, "A3", "me", 8.0)
+    assert len(files(tmp_path)) == 3
+
+
+def test_a_request_that_was_refused_may_be_made_again_under_its_key(tmp_path, monkeypatch):
+    desk = make_desk(tmp_path)
+    rename = os.replace
+
+    def refuse(old, new):
+        raise PermissionError(13, "in use")
+
+    monkeypatch.setattr(gateway, "PAUSE_S", 0.0)
+    monkeypatch.setattr(os, "replace", refuse)
+    assert "in use" in ask(desk, {**FLASH, "key": "a"})["error"]
+    monkeypatch.setattr(os, "replace", rename)
+    assert ask(make_desk(tmp_path), {**FLASH, "key": "a"})["ok"]
+    assert ask(make_desk(tmp_path), {**FLASH, "key": "a"})["ok"]
+    assert len(files(tmp_path)) == 1
+
+
+def test_a_file_that_windows_holds_for_a_moment_is_renamed_all_the_same(tmp_path, monkeypatch):
+    desk = make_desk(tmp_path)
+    rename, refusals = os.replace, iter([True, True, False])
+
+    def sometimes(old, new):
+        if next(refusals):
+            raise PermissionError(13, "in use")
+        rename(old, new)
+
+    monkeypatch.setattr(gateway, "PAUSE_S", 0.0)
+    monkeypatch.setattr(os, "replace", sometimes)
+    assert ask(desk, FLASH)["ok"]
+    assert len(files(tmp_path)) == 1
+
+
 def test_missing_keys_are_named_together(desk):
     reply = ask(desk, {"token": TOKEN, "method": "flash"})
     assert reply["error"].startswith("missing key 'duration', missing key 'labels'; known are")
@@ -115,13 +187,14 @@ def test_the_queue_has_a_limit(desk, tmp_path, monkeypatch):
     assert ask(desk, FLASH)["ok"]
     assert ask(desk, FLASH)["ok"]
     assert "2 instruction files wait in" in ask(desk, FLASH)["error"]
+    assert "2 instruction files wait in" in ask(desk, {"token": TOKEN, "method": "status"})["trouble"]
     (tmp_path / "robotd-000000000001.txt").unlink()
     assert ask(desk, FLASH)["ok"]
 
 
 def test_a_folder_that_cannot_be_written_is_an_answer(desk, tmp_path):
     shutil.rmtree(tmp_path / ".robotd-labels")
-    assert "cannot be written: No such file or directory" in ask(desk, FLASH)["error"]
+    assert "cannot be written" in ask(desk, FLASH)["error"]
     (tmp_path / ".robotd-labels").mkdir()
     assert ask(desk, FLASH)["ok"]
 
@@ -147,9 +220,44 @@ def test_any_line_has_an_answer(tmp_path_factory, line):
 def test_any_request_is_obeyed_or_refused_and_only_obeyed_ones_leave_a_file(tmp_path_factory, change):
     folder = tmp_path_factory.mktemp("folder")
     reply = ask(make_desk(folder), {**FLASH, **change})
-    assert bool(files(folder)) == (reply["ok"] and "waiting" not in reply)
+    asked = reply["ok"] and "waiting" not in reply and len(reply["refused"]) < len({**FLASH, **change}["labels"])
+    assert bool(files(folder)) == asked
     for text in files(folder).values():
         assert all(line.count(";") == 3 and line.startswith("FLASH;") for line in text.splitlines())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.sampled_from([b"noise", b"", b"[]", b"{}", b"\xff\x00", json.dumps(FLASH).encode()])), st.data())
+def test_every_line_has_its_answer_however_the_bytes_are_cut(tmp_path_factory, lines, data):
+    desk = make_desk(tmp_path_factory.mktemp("folder"))
+    sent = b"".join(line + b"\n" for line in lines) + data.draw(st.sampled_from([b"", b'{"half": 1']))
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(sent)), max_size=6)))
+
+    async def run():
+        reader = asyncio.StreamReader(limit=gateway.LINE_LIMIT)
+        replies = []
+
+        async def nothing():
+            await asyncio.sleep(0)
+
+        writer = SimpleNamespace(
+            write=replies.append,
+            drain=nothing,
+            close=lambda: None,
+            wait_closed=nothing,
+            get_extra_info=lambda name: ("here", 1),
+        )
+        talk = asyncio.create_task(desk._connected(reader, writer))
+        for begin, end in zip([0, *cuts], [*cuts, len(sent)], strict=True):
+            reader.feed_data(sent[begin:end])
+            await asyncio.sleep(0)
+        reader.feed_eof()
+        await talk
+        return [json.loads(reply) for reply in replies]
+
+    replies = run_virtual(run())
+    asked = [line for line in lines if line.strip()]
+    assert [reply["ok"] for reply in replies] == [line.startswith(b'{"id"') for line in asked]
 
 
 def test_deep_nesting_and_long_numbers_are_noise_too(desk):
@@ -164,10 +272,10 @@ def test_the_instruction_file_follows_the_template(tmp_path):
     outbox = Outbox(tmp_path, "LED {label} t={duration:03d} s={strength:.0%}")
     outbox.open()
     desk = Gateway(outbox, None)
-    assert ask(desk, {"method": "flash", "labels": ["A1"], "duration": 7}) == {"id": None, "ok": True}
+    assert ask(desk, {"method": "flash", "labels": ["A1"], "duration": 7}) == {"id": None, "ok": True, "refused": {}}
     assert files(tmp_path) == {"robotd-000000000001.txt": "LED A1 t=007 s=100%\n"}
     for label in ("A 1", "A=1"):
-        assert "which separates" in ask(desk, {"method": "flash", "labels": [label], "duration": 7})["error"]
+        assert "which separates" in ask(desk, {"method": "flash", "labels": [label], "duration": 7})["refused"][label]
 
 
 @pytest.mark.parametrize(
@@ -196,7 +304,7 @@ def test_numbers_go_on_after_a_restart_also_when_the_files_are_gone(tmp_path):
 def test_a_key_is_obeyed_once_also_over_a_restart(tmp_path):
     desk = make_desk(tmp_path)
     for key in ("a", "b", "a", "b"):
-        assert ask(desk, {**FLASH, "key": key}) == {"id": 1, "ok": True}
+        assert ask(desk, {**FLASH, "key": key})["ok"]
     assert len(files(tmp_path)) == 2
     assert ask(make_desk(tmp_path), {**FLASH, "key": "a"})["ok"]
     assert len(files(tmp_path)) == 2
@@ -261,7 +369,7 @@ def test_the_log_says_who_asked_for_what_and_is_put_aside_when_long(tmp_path, mo
         "key": "4",
         "sender": "10.0.0.7",
         "labels": ["A17", "B 2"],
-        "duration": 3,
+        "duration": [3, 3],
         "strength": 1.0,
     }
     assert ask(make_desk(tmp_path), {**FLASH, "key": "3"})["ok"]
@@ -360,17 +468,18 @@ def test_the_driver_brings_flashes_to_the_folder_in_no_virtual_time(tmp_path):
             driver = make_driver(tmp_path, running.port)
             assert isinstance(driver, Labels)
             await driver.open()
-            await driver.flash(["A1", "A2"], 1.0, 3.0)
-            await driver.flash([f"L{number}" for number in range(501)], 0.5, 4)
-            await driver.flash([], 1.0, 3)
+            assert await driver.flash(["A1", "A2"], 1.0, [3, 4]) == {}
+            refused = await driver.flash([*(f"L{number}" for number in range(500)), "L;1"], 0.5, [4] * 501)
+            assert refused == {"L;1": 'it has ";", which separates fields in instruction files'}
+            await driver.flash([], 1.0, [])
             assert now() == 0.0
             await driver.close()
             await driver.close()
 
         run_virtual(run())
         texts = list(files(running.watched).values())
-    assert texts[0] == "FLASH;A1;3;1.0\nFLASH;A2;3;1.0\n"
-    assert [text.count("\n") for text in texts] == [2, 500, 1]
+    assert texts[0] == "FLASH;A1;3;1.0\nFLASH;A2;4;1.0\n"
+    assert [text.count("\n") for text in texts] == [2, 500]
 
 
 def test_the_driver_finds_a_restarted_gateway_and_repeats_nothing(tmp_path):
@@ -378,15 +487,15 @@ def test_the_driver_finds_a_restarted_gateway_and_repeats_nothing(tmp_path):
         with program(tmp_path) as first:
             driver = make_driver(tmp_path, first.port)
             await driver.open()
-            await driver.flash(["A1"], 1.0, 3)
+            await driver.flash(["A1"], 1.0, [3])
             first.process.kill()
             first.process.wait()
             with program(tmp_path, port=first.port) as second:
-                await driver.flash(["A2"], 1.0, 3)
+                await driver.flash(["A2"], 1.0, [3])
                 assert [text[6:8] for text in files(second.watched).values()] == ["A1", "A2"]
         watch = asyncio.create_task(driver.run())
         with pytest.raises(DriverFault, match=r"labels: robotd-labels at 127.0.0.1:\d+ cannot be reached"):
-            await driver.flash(["A3"], 1.0, 3)
+            await driver.flash(["A3"], 1.0, [3])
         with pytest.raises(DriverFault, match="cannot be reached"):  # so that its supervisor opens it again
             await watch
         await driver.close()
@@ -394,17 +503,27 @@ def test_the_driver_finds_a_restarted_gateway_and_repeats_nothing(tmp_path):
     run_virtual(run())
 
 
-def test_the_driver_says_why_a_request_was_refused(tmp_path):
+def test_a_gateway_that_takes_nothing_is_a_fault_until_that_is_mended(tmp_path):
     with program(tmp_path) as running:
 
         async def run():
             driver = make_driver(tmp_path, running.port)
             await driver.open()
+            watch = asyncio.create_task(driver.run())
+            (running.watched / ".robotd-labels").rename(tmp_path / "aside")
             with pytest.raises(
-                MissionError, match=r"labels: robotd-labels refuses: duration: found 0.5; expected whole"
+                DriverFault, match=r"labels: robotd-labels at 127.0.0.1:\d+ refuses: .* cannot be written"
             ):
-                await driver.flash(["A1"], 1.0, 0.5)
-            await driver.flash(["A1"], 1.0, 1)
+                await driver.flash(["A1"], 1.0, [3])
+            with pytest.raises(DriverFault, match="cannot be written"):
+                await watch
+            await driver.close()
+            with pytest.raises(DriverFault, match="cannot be written"):
+                await driver.open()
+            await driver.close()
+            (tmp_path / "aside").rename(running.watched / ".robotd-labels")
+            await driver.open()
+            assert await driver.flash(["A1"], 1.0, [1]) == {}
             await driver.close()
             (tmp_path / "token").write_text("old")
             with pytest.raises(DriverFault, match="refuses: token: missing or wrong"):
@@ -415,6 +534,7 @@ def test_the_driver_says_why_a_request_was_refused(tmp_path):
                 await driver.open()
 
         run_virtual(run())
+    assert len(files(running.watched)) == 1
 
 
 @contextmanager
@@ -448,6 +568,7 @@ def test_the_driver_does_not_trust_whoever_listens(tmp_path):
             ("HTTP/1.1 400 Bad Request\n", "does not answer like robotd-labels"),
             ("[]\n", "does not answer like robotd-labels"),
             ('{"id": 7, "ok": true}\n', "does not answer like robotd-labels"),
+            ('{"id": 1, "ok": true, "refused": ["A1"]}\n', "does not answer like robotd-labels"),
             ("", "closed the connection"),
             ('{"id": 1, "ok"', "closed the connection"),
             ("x" * 100_000 + "\n", "does not answer like robotd-labels"),

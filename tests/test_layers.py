@@ -38,7 +38,7 @@ LAYERS = {
         "recording_upload",
         "journal_records",
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
-        *("camera_feed", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
+        *("camera_feed", "prompt", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
     ],
     3: ["plugin", "camera_driver", "workbench"],
     4: ["drivers"],

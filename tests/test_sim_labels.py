@@ -220,8 +220,8 @@ def test_half_written_and_foreign_files_do_no_harm(tmp_path):
 def test_it_understands_what_the_gateway_writes(tmp_path):
     outbox = Outbox(tmp_path)
     outbox.open()
-    outbox.flash(["A0", "A5"], 3, 1.0, None, "test")
-    outbox.flash(["A6"], 1, 1e-05, None, "test")
+    outbox.flash(["A0", "A5"], [3, 3], 1.0, None, "test")
+    outbox.flash(["A6"], [1], 1e-05, None, "test")
     system = make_system(tmp_path, PROMPT)
     system.scan(0.0)
     assert (system.commands, system.lost, system.ignored) == (3, 0, 0)

@@ -1,0 +1,258 @@
+"""What the robot itself knows of where labels are, so that at the next stop it knows where their lights must appear.
+
+The map is made off the robot. Here, rays to the labels seen at earlier stops are intersected in odometry axes, by least
+squares in which a ray counts less the further the robot has driven since, with a broad prior on the depth along the
+newest one. From a single stop that leaves a label on a stretch of its ray; so a predicted image position is a mixture
+of a few points along the least known direction of the label's covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.camera import Camera
+from ..geometry.transforms import invert_rigid, pose_matrix, transform_points
+from ..records import CameraModel, Floats, Pose, Sighting
+from .decoder import Numbers, Prior
+from .inquiry import Candidates
+from .settings import IdentifyConfig
+
+HEADING_NOISE = 0.018  # rad of odometry's heading after one metre, growing with the root of the distance
+RAY_NOISE = 0.008  # rad of one ray: tilt of the floor, calibration
+DEPTH_M, DEPTH_SIGMA_M = 1.5, 1.2  # of a label from the robot, before it was seen from a second stop
+FARTHEST_M = 8.0
+RAYS_KEPT = 6  # newest of each label
+POINTS = np.array([-1.8, -1.2, -0.6, 0.0, 0.6, 1.2, 1.8])  # along the least known direction, in standard deviations
+POINT_WEIGHTS = np.exp(-0.5 * POINTS**2) / np.exp(-0.5 * POINTS**2).sum()
+SHOWS = 0.9  # probability that a label which is predicted to be in view can be seen
+FORGETS = 0.6  # factor of that for each time in a row that it could not
+ELSEWHERE = 0.003  # the same of a label whose place is known and out of view
+UNLIKELY_S = 3.0  # spent on labels that are known and probably not in view
+EXPECTED = 0.3  # from which on a label is asked as one that is in view
+NEW_LIGHTS, FIRST_LIGHTS = 10.0, 40.0  # labels never seen before that a stop shows; the first stop
+REACH = 1.25  # times the distance within which 95 % of the sightings lie: further labels do not show
+NARROW = 0.35  # cosine of the angle between two directions to a label from which on it may not show from the second
+RARELY = 0.15  # probability that such a label shows
+MISPREDICTED = 0.05  # of lights are not where they were predicted: reflections, wrong names, slips
+GATE = 3.0  # standard deviations within which two predictions may be mistaken for one another
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prediction:
+    """Image positions of the labels `labels` (M,): per camera, label and point, with weights that sum to the label's
+    probability of being in that camera's view. `distances` (M,) in metres; `sure` where that is known to a fifth."""
+
+    labels: Numbers
+    distances: Floats
+    sure: NDArray[np.bool_]
+    pixels: Floats  # (C, M, P, 2)
+    weights: Floats  # (C, M, P)
+    sigmas: Floats  # (C, M, P)
+
+
+class LabelMemory:
+    """Rays to labels in odometry axes, and what was asked at earlier stops; lives as long as the mission's leg.
+
+    Parameters
+    ----------
+    labels : sequence of str
+    cameras : sequence of CameraModel
+        The rig; frames and sightings carry their names.
+    zones : sequence of (labels, begin, end)
+        Labels that can be seen only while the robot is between two distances along the line, in metres.
+    """
+
+    def __init__(
+        self,
+        labels: Sequence[str],
+        cameras: Sequence[CameraModel],
+        config: IdentifyConfig,
+        zones: Iterable[tuple[Sequence[str], float, float]] = (),
+    ) -> None:
+        self.config = config
+        self.index: Mapping[str, int] = {label: number for number, label in enumerate(labels)}
+        self.asked = np.zeros(len(labels), np.intp)
+        self.learnt: set[str] = set()  # labels whose further flashes would teach the map nothing: the solver's plan
+        self.refused: set[str] = set()  # labels that the label system does not take
+        self._cameras = [Camera(camera) for camera in cameras]
+        self._height = float(np.mean([camera.T_robot_camera[2, 3] for camera in self._cameras] or [0.0]))
+        self._number = {camera.name: number for number, camera in enumerate(cameras)}
+        self._zones = [
+            (np.array([self.index[label] for label in names if label in self.index], np.intp), begin, end)
+            for names, begin, end in zones
+        ]
+        self._missed = np.zeros(len(labels), np.intp)
+        self._distances: list[float] = []
+        self._prediction: _Prediction | None = None
+        self._expected = np.zeros(len(labels), bool)
+        self.forget_places()
+
+    def forget_places(self) -> None:
+        """Odometry was interrupted: what was seen before is somewhere else now."""
+        self._rays: dict[int, list[tuple[Floats, Floats, float]]] = {}  # origin, direction, travelled
+
+    def forget(self, label: str) -> None:
+        """The label was taken for another one."""
+        self._rays.pop(self.index[label], None)
+
+    @property
+    def known(self) -> int:
+        """Number of labels that have been seen."""
+        return len(self._rays)
+
+    def candidates(self, pose: Pose, travelled: float, cameras: Sequence[str]) -> Candidates:
+        """Which labels these cameras may see from a pose in odometry axes, `travelled` metres along the line."""
+        total = len(self.index)
+        unseen = np.ones(total, bool)
+        unseen[list(self._rays)] = False
+        fresh = FIRST_LIGHTS if not self._rays else NEW_LIGHTS
+        weights = np.where(unseen, min(0.5, fresh / max(1, int(unseen.sum()))), ELSEWHERE)
+        self._prediction = prediction = self._predict(pose, travelled, cameras)
+        share = prediction.weights.sum(axis=(0, 2))
+        weights[prediction.labels] = np.maximum(SHOWS * FORGETS ** self._missed[prediction.labels] * share, ELSEWHERE)
+        self._expected = ~unseen & (weights >= EXPECTED * SHOWS)
+        wanted = unseen | self._expected
+        unlikely = np.flatnonzero(~wanted)
+        few = round(UNLIKELY_S * self.config.commands_per_s)
+        wanted[unlikely[np.argsort(-weights[unlikely], kind="stable")[:few]]] = True
+        for labels, begin, end in self._zones:
+            if not begin <= travelled <= end:
+                wanted[labels] = False
+                weights[labels] = 0.0
+        wanted[[self.index[label] for label in self.learnt | self.refused]] = False
+        return Candidates(weights, self._expected & wanted, wanted, self.asked.copy(), self._rivals())
+
+    def prior(self, candidates: Candidates, cameras: Sequence[str], pixels: Floats) -> Prior:
+        """What the positions (N, 2) of lights in those cameras say about which labels they are."""
+        prediction = self._prediction
+        if prediction is None or not len(prediction.labels) or not len(pixels):
+            return Prior(candidates.weights)
+        number = np.array([self._number[camera] for camera in cameras], np.intp)
+        area = np.array([float(np.prod(camera.size)) for camera in self._cameras])
+        inside = np.maximum(prediction.weights.sum(axis=(0, 2)), 1e-6)
+        ratios = np.empty((len(pixels), len(prediction.labels)))
+        for light, camera in enumerate(number):
+            sigma = prediction.sigmas[camera]
+            squares = ((prediction.pixels[camera] - pixels[light]) ** 2).sum(axis=2) / sigma**2
+            density = (prediction.weights[camera] * np.exp(-0.5 * squares) / (2.0 * np.pi * sigma**2)).sum(axis=1)
+            ratios[light] = (1.0 - MISPREDICTED) * density / inside * area.sum() + MISPREDICTED
+        return Prior(candidates.weights, prediction.labels, np.log(ratios))
+
+    def record(self, pose: Pose, travelled: float, sightings: Sequence[Sighting], asked: NDArray[np.bool_]) -> None:
+        """Take in the sightings of a stop, and which labels (L,) were asked to flash there."""
+        T_world_robot = pose_matrix(pose.x, pose.y, pose.heading)
+        seen: dict[int, list[tuple[Floats, Floats, float]]] = {}
+        for sighting in sightings:
+            camera = self._cameras[self._number[sighting.camera]]
+            rays, valid = camera.rays(np.array([[sighting.u, sighting.v]]))
+            if valid[0] and sighting.label in self.index:
+                T = T_world_robot @ camera.T_robot_camera
+                ray = (T[:3, 3], T[:3, :3] @ rays[0], travelled)
+                seen.setdefault(self.index[sighting.label], []).append(ray)
+        self._distances = (self._distances + self._measured(seen))[-500:]
+        for label, rays_ in seen.items():
+            self._rays[label] = (self._rays.get(label, []) + rays_)[-RAYS_KEPT:]
+        self.asked[asked] += 1
+        answered = np.zeros(len(asked), bool)
+        answered[list(seen)] = True
+        self._missed[asked & self._expected & ~answered] += 1
+        self._missed[answered] = 0
+
+    def _measured(self, seen: Mapping[int, list[tuple[Floats, Floats, float]]]) -> list[float]:
+        """Distances of the labels that have just been seen and were predicted."""
+        prediction = self._prediction
+        if prediction is None:
+            return []
+        return [
+            float(prediction.distances[row])
+            for row, label in enumerate(prediction.labels)
+            if label in seen and prediction.sure[row]
+        ]
+
+    # ---- geometry ----------------------------------------------------------------------------------------------------
+
+    def _points(self, travelled: float) -> tuple[Numbers, Floats, Floats, Floats, Floats]:
+        """Seen labels (M,), positions (M, 3) with covariances (M, 3, 3), metres driven since, directions seen from."""
+        labels = np.array(list(self._rays), np.intp)
+        owner = np.repeat(np.arange(len(labels)), [len(rays) for rays in self._rays.values()])
+        rays = [ray for each in self._rays.values() for ray in each]
+        origin = np.array([ray[0] for ray in rays]).reshape(-1, 3)
+        along = np.array([ray[1] for ray in rays]).reshape(-1, 3)
+        since = np.maximum(travelled - np.array([ray[2] for ray in rays]), 0.0)
+        newest = np.cumsum([len(each) for each in self._rays.values()]) - 1 if len(labels) else np.zeros(0, np.intp)
+        noise = np.hypot(RAY_NOISE, HEADING_NOISE * np.sqrt(since))
+        across = np.eye(3) - along[:, :, None] * along[:, None, :]
+        start: Floats = origin[newest] + DEPTH_M * along[newest]
+        points: Floats = start.copy()
+        information = np.zeros((len(labels), 3, 3))
+        for _ in range(4):
+            offset = points[owner] - origin
+            distance = np.clip(np.linalg.norm(offset, axis=1), 0.3, FARTHEST_M)
+            miss = np.linalg.norm((across @ offset[:, :, None])[:, :, 0], axis=1) / distance / noise
+            trust = 1.0 / (1.0 + (miss / 3.0) ** 2)
+            weighted = (trust / (noise * distance) ** 2)[:, None, None] * across
+            information = along[newest][:, :, None] * along[newest][:, None, :] / DEPTH_SIGMA_M**2
+            right = (information @ start[:, :, None])[:, :, 0]
+            np.add.at(information, owner, weighted)
+            np.add.at(right, owner, (weighted @ origin[:, :, None])[:, :, 0])
+            points = np.asarray(np.linalg.solve(information, right[:, :, None])[:, :, 0])
+        facing = np.zeros((len(labels), 3))
+        np.add.at(facing, owner, -along)
+        facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
+        return labels, points, np.asarray(np.linalg.inv(information)), np.asarray(since[newest]), facing
+
+    def _predict(self, pose: Pose, travelled: float, names: Sequence[str]) -> _Prediction:
+        labels, points, covariances, since, facing = self._points(travelled)
+        near = np.hypot(points[:, 0] - pose.x, points[:, 1] - pose.y) < FARTHEST_M
+        labels, points, covariances = labels[near], points[near], covariances[near]
+        since, facing = since[near], facing[near]
+        variances, axes = np.linalg.eigh(covariances)
+        long = np.sqrt(variances[:, -1])[:, None, None] * axes[:, None, :, -1]
+        spread = points[:, None, :] + POINTS[None, :, None] * long  # (M, P, 3)
+        away = np.array([pose.x, pose.y, self._height]) - spread
+        distances = np.linalg.norm(away, axis=2)
+        reach = REACH * float(np.quantile(self._distances, 0.95)) if len(self._distances) >= 20 else FARTHEST_M
+        shows = (distances <= reach) & ((facing[:, None, :] * away).sum(axis=2) >= NARROW * distances)
+        shares = np.where(shows, 1.0, RARELY) * POINT_WEIGHTS
+        sure = np.sqrt(variances[:, -1]) < 0.2 * distances.mean(axis=1)
+        T_robot_world = invert_rigid(pose_matrix(pose.x, pose.y, pose.heading))
+        shape = (len(self._cameras), len(labels), len(POINTS))
+        pixels, weights, sigmas = np.full((*shape, 2), -1e6), np.zeros(shape), np.ones(shape)
+        for number, camera in enumerate(self._cameras):
+            if camera.name not in names:
+                continue
+            there = transform_points(invert_rigid(camera.T_robot_camera) @ T_robot_world, spread.reshape(-1, 3))
+            uv, valid = camera.project(there)
+            valid &= camera.in_image(np.where(valid[:, None], uv, -1e6), margin=2.0)
+            uv = np.where(valid[:, None], uv, -1e6).reshape(*shape[1:], 2)
+            step = np.linalg.norm(np.gradient(uv, axis=1), axis=2)
+            heading = camera.focal[0] * np.hypot(RAY_NOISE, HEADING_NOISE * np.sqrt(since))[:, None]
+            pixels[number] = uv
+            weights[number] = valid.reshape(shape[1:]) * shares
+            sigmas[number] = np.sqrt(self.config.prediction_px**2 + heading**2 + np.minimum(0.5 * step, 60.0) ** 2)
+        return _Prediction(labels, distances.mean(axis=1), sure, pixels, weights, sigmas)
+
+    def _rivals(self) -> dict[int, Numbers]:
+        """For every expected label, those that its light could be taken for by its position."""
+        prediction = self._prediction
+        assert prediction is not None
+        chosen = np.flatnonzero(self._expected[prediction.labels])
+        labels = prediction.labels[chosen]
+        weights = prediction.weights[:, chosen]
+        shown = weights.sum(axis=2)
+        centre = (weights[..., None] * prediction.pixels[:, chosen]).sum(axis=2) / np.maximum(shown, 1e-9)[..., None]
+        reach = np.sqrt(
+            (weights * (prediction.sigmas[:, chosen] ** 2)).sum(axis=2) / np.maximum(shown, 1e-9)
+            + (weights * ((prediction.pixels[:, chosen] - centre[:, :, None]) ** 2).sum(axis=3)).sum(axis=2)
+            / np.maximum(shown, 1e-9)
+        )
+        rivals = {}
+        for row, label in enumerate(labels):
+            apart = np.linalg.norm(centre - centre[:, row, None], axis=2)
+            close = (apart < GATE * np.hypot(reach, reach[:, row, None])) & (shown > 0.1) & (shown[:, row, None] > 0.1)
+            rivals[int(label)] = labels[close.any(axis=0) | (labels == label)]
+        return rivals
