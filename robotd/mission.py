@@ -273,7 +273,9 @@ class Mission:
     def _along(self) -> float:
         """Metres along the line, counted as `stops` are."""
         state = self.bus.odometry.latest
-        begin = self.config.stops[self.first_stop - 1] if self.config.stops and self.config.stop_at == "distances" else 0.0
+        begin = (
+            self.config.stops[self.first_stop - 1] if self.config.stops and self.config.stop_at == "distances" else 0.0
+        )
         return begin + (0.0 if state is None else state.travelled - self._by_hand)
 
     async def _watch(self, identifier: Identifier, camera: str, frames: Subscription[Frame]) -> None:

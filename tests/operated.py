@@ -50,8 +50,9 @@ class Labels(Driver):
     kind = "labels"
     asked = ()
 
-    async def flash(self, labels, strength, duration):
-        self.asked = (*self.asked, (tuple(labels), duration))
+    async def flash(self, labels, strength, durations):
+        self.asked = (*self.asked, (tuple(labels), tuple(durations)))
+        return {}
 
 
 class RpcClient:

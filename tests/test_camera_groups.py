@@ -225,12 +225,13 @@ class TwoSlots:
     """In place of the Identifier: two slots for each group of cameras, and one sighting by each camera."""
 
     made = []  # noqa: RUF012
+    mistaken, undecided = (), 0
 
-    def __init__(self, labels, cameras, config):
+    def __init__(self, labels, cameras, config, **known):
         self.cameras, self.slots, self.frames = cameras, [Slot(0, (), 2.0), Slot(1, (), 2.0)], set()
         TwoSlots.made.append(self)
 
-    def next_slot(self):
+    def next_slot(self, t):
         return self.slots.pop(0) if self.slots else None
 
     def begin(self, slot, t):
@@ -242,7 +243,7 @@ class TwoSlots:
     def update(self, camera, frame):
         self.frames.add(camera)
 
-    def finish(self):
+    def finish(self, t):
         return tuple(Sighting(camera, "A", 1.0, 1.0) for camera in sorted(self.frames))
 
 
@@ -306,9 +307,9 @@ def test_a_pair_that_has_looked_does_not_look_again_when_the_other_failed(monkey
 
     plain = TwoSlots.finish
 
-    def finish(self):
+    def finish(self, t):
         Films.fails = self.cameras == ("front", "rear") and len(TwoSlots.made) == 1
-        return plain(self)
+        return plain(self, t)
 
     monkeypatch.setattr(TwoSlots, "finish", finish)
     seen, _, _ = look(config, trouble=lambda: None)

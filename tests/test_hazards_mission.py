@@ -85,8 +85,8 @@ class Eye(Nothing):
 
 
 class Silent(Nothing):
-    async def flash(self, labels, strength, duration):
-        pass
+    async def flash(self, labels, strength, durations):
+        return {}
 
 
 def mission(tmp_path, scenario):

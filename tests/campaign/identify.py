@@ -3,8 +3,8 @@
     python -m tests.campaign.identify [--seeds N] [--only coded|schemes|mapped|store]   prints the tables
     pytest tests/campaign/identify.py                                                   checks the numbers
 
-A stop's time runs from the first request to the last slot's end. Each camera misses 3 % of the flashes and sees 1 % that
-nobody asked for, besides the 2 % of the commands that the label system loses.
+A stop's time runs from the first request to the last slot's end. Each camera misses 3 % of the flashes and sees 1 %
+that nobody asked for, besides the 2 % of the commands that the label system loses.
 """
 
 import argparse
