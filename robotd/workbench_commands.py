@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import InputError
 from .files import write_atomic
@@ -25,15 +24,15 @@ from .toml_edit import toml
 from .workbench import pictures
 from .workbench.detectors import Detector, make_detector, plain_settings, read_settings
 from .workbench.export import export_frames, export_recording
-from .workbench.player import Player, write_picture, write_video
+from .workbench.player import Player, mean_picture, write_picture, write_video
 from .workbench.score import Score
-from .workbench.sequence import Tagged, appearances, judge_clips, open_all, open_tagged, steps
+from .workbench.sequence import Tagged, appearances, judge_clips, measure, open_all, open_tagged, steps
 from .workbench.tags import NEAR_PX, Tag, add_tag, load_tags, remove_tags, save_tags, tags_path
 from .workbench.trace import Trace
 from .workbench.tune import Trial, parse_range, score_set, shared
 from .workbench.tune import tune as search
 
-Grey = NDArray[np.uint8]
+QUANTILES = (5, 25, 50, 75, 95)
 
 
 def info(arguments: argparse.Namespace) -> int:
@@ -133,7 +132,7 @@ def tag(arguments: argparse.Namespace) -> int:
     if arguments.picture is not None:
         seen = pictures.Seen(shown, proposals=proposals)
         title = f"{tagged.name}: {len(shown)} marks" + (f", {len(proposals)} proposals" if proposals else "")
-        write_picture(arguments.picture, pictures.overlay(_mean(tagged), seen, title, grid=True))
+        write_picture(arguments.picture, pictures.overlay(mean_picture(tagged), seen, title, grid=True))
     for number, one in enumerate(shown, 1):
         span = f" from {one.since:g} s" * (one.since > 0) + (f" until {one.until:g} s" if one.until is not None else "")
         _say(arguments, f"mark {number}: {one.kind} {one.label or ''} at {one.u:g},{one.v:g}{span}")
@@ -235,6 +234,36 @@ def show(arguments: argparse.Namespace) -> int:
     if trace is not None:
         result["trace"] = asdict(trace.since(shot.t - arguments.window))
     return _done(arguments, result)
+
+
+def compare(arguments: argparse.Namespace) -> int:
+    """What a detector measures at marked labels, beside what it measures elsewhere."""
+    opened = _open_all(arguments)
+    _need_tags(opened, arguments)
+    found = [
+        item for one in opened for item in measure(one, _detector(arguments, one), arguments.since, arguments.until)
+    ]
+    if not found:
+        raise InputError(f"the detector '{arguments.detector}' had no trigger in this footage")
+    values = {
+        name: ([i.values[name] for i in found if i.on_label], [i.values[name] for i in found if not i.on_label])
+        for name in found[0].values
+    }
+    table = {
+        name: {
+            where: {f"{q}%": round(float(np.percentile(chosen, q)), 4) for q in (5, 25, 50, 75, 95)}
+            | {"n": len(chosen)}
+            for where, chosen in (("on_labels", on_label), ("elsewhere", elsewhere))
+            if chosen
+        }
+        for name, (on_label, elsewhere) in values.items()
+    }
+    for name, entry in table.items():
+        for where, row in entry.items():
+            _say(arguments, f"{name:>12} {where:>10}: " + "  ".join(f"{key} {value:g}" for key, value in row.items()))
+    if arguments.picture is not None:
+        write_picture(arguments.picture, pictures.histograms(values, (1000, 260)))
+    return _done(arguments, {"detector": arguments.detector, "measured": table})
 
 
 def score(arguments: argparse.Namespace) -> int:
@@ -419,16 +448,6 @@ def _trace(arguments: argparse.Namespace, tagged: Tagged) -> Trace | None:
         raise InputError(f"no mark {arguments.mark}; there are {len(tagged.tags)}")
     chosen = tagged.tags[arguments.mark - 1]
     return Trace(chosen.u, chosen.v)
-
-
-def _mean(tagged: Tagged) -> Grey:
-    """The mean of the first 60 frames, in which walkers and noise are faint."""
-    images: list[Grey] = []
-    for _, shot in tagged.frames():
-        images.append(shot.image)
-        if len(images) == 60:
-            break
-    return np.asarray(np.rint(np.mean(images, axis=0, dtype=np.float32)), dtype=np.uint8)
 
 
 def _flash(flash: Flash) -> dict[str, Any]:

@@ -84,6 +84,12 @@ def add(commands: argparse._SubParsersAction[Parser]) -> None:
     show.add_argument("--window", type=_positive, default=4.0, metavar="S", help="of the course (default: 4)")
     show.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
 
+    compare = command("compare", "what a detector measures at marked labels and elsewhere", several=True)
+    _footage(compare, several=True)
+    _span(compare)
+    _detector(compare)
+    compare.add_argument("--picture", type=Path, metavar="PNG", help="draw the distributions")
+
     score = command("score", "recall, precision and centroid spread over tagged footage", several=True)
     _footage(score, several=True)
     _span(score)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from robotd.drivers.mjpeg import MjpegConfig, MjpegDriver
 
+from robotd import jpeg
 from robotd.bind import bind
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
@@ -142,6 +143,7 @@ def test_a_larger_image_is_decoded_to_the_size_asked_for_and_another_is_a_fault(
         async with running(driver, CameraMode((32, 24))):
             (frame,) = await collect(driver, 1)
             assert frame.image.shape == (24, 32)
+            assert jpeg.read_header(frame.encoded)[:2] == (64, 48), "as the camera sent it"
         async with running(a_driver(url), CameraMode((40, 30))) as task:
             with pytest.raises(DriverFault, match="gives 64x48 pixels instead of 40x30 or 2, 4 or 8 times that"):
                 await task

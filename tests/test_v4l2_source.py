@@ -204,7 +204,24 @@ def test_raw_images_give_their_brightness(camera, pixels, padding):
 
     frame, damaged = on_camera(steps, mode)
     assert np.array_equal(frame.image, grey)
+    assert frame.encoded is None
     assert damaged == 1
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_a_frame_keeps_the_jpeg_as_the_camera_sent_it(camera, factor):
+    size = (32 * factor, 24 * factor)
+    camera.formats = {"MJPG": {size: [20.0]}}
+    data = [jpeg(90 + k, size) for k in range(3)]
+
+    async def steps(source):
+        for item in data:
+            camera.send(item, 0.0)
+        return [await source.read() for _ in data]
+
+    frames = on_camera(steps, SMALL)
+    assert [frame.encoded for frame in frames] == data
+    assert [frame.image.shape for frame in frames] == [(24, 32)] * 3
 
 
 def test_frames_carry_the_kernels_time_and_count(camera):

@@ -293,6 +293,17 @@ def test_a_trace_follows_the_light_and_the_pattern_lies_on_its_flashes(shelf):
     assert len(late.scores) == len(late.score_times) < len(trace.scores)
 
 
+@pytest.mark.parametrize("name", ["robotd", "thesis"])
+def test_what_is_measured_at_labels_is_set_beside_the_rest(tmp_path, capsys, shelf, name):
+    done = bench(capsys, "compare", shelf, "--detector", name, "--until", "2.5", "--picture", tmp_path / "x.png")
+    measured = done["measured"]
+    assert set(measured) == ({"alternation", "score", "margin"} if name == "robotd" else {"area", "length", "change"})
+    assert measured["score" if name == "robotd" else "area"]["on_labels"]["n"] >= 3
+    if name == "robotd":
+        assert measured["score"]["on_labels"]["5%"] > 10.0
+    assert cv2.imread(str(tmp_path / "x.png")).shape == (780, 1000, 3)
+
+
 # ---- pictures and playing --------------------------------------------------------------------------------------------
 
 

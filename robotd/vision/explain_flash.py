@@ -24,13 +24,18 @@ State = Literal["found", "undecided", "refused"]
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """A place that caught the detector's eye; `passed` its first filters, and `note` says what it measured there."""
+    """A place that caught the detector's eye; `passed` its filters, `values` are what it measured there, by name."""
 
     u: float
     v: float
     size: float  # px across
     passed: bool
-    note: str
+    values: dict[str, float]
+
+    @property
+    def note(self) -> str:
+        """The values in words."""
+        return ", ".join(f"{name} {value:.3g}" for name, value in self.values.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +70,17 @@ class FlashExplanation:
 def explain_blink(detector: FlashDetector, shape: tuple[int, int]) -> FlashExplanation:
     """The state of `FlashDetector` in images of this shape (H, W)."""
     threshold = detector.config.min_score(shape)
-    unit = "alternation in the pattern's rhythm, but for known lights"
+    unit = "alternation in the pattern's rhythm"
     if detector._ring is None or not detector._blocks:
         return FlashExplanation(np.zeros(shape, np.float32), unit, (), (), threshold)
     energy = np.maximum(detector._window + detector._total, 0).astype(np.float32)
     change = cv2.resize(np.sqrt(energy), shape[::-1], interpolation=cv2.INTER_NEAREST)
     clusters = [_track(detector, track) for track in detector.tracks]
     triggers = []
+    known = len(detector.tracks)
     rows, columns = detector._candidates()
+    rows = np.concatenate([np.array([track.row for track in detector.tracks], np.intp), rows])
+    columns = np.concatenate([np.array([track.column for track in detector.tracks], np.intp), columns])
     if len(rows) and detector._times[-1][1] - detector._times[0][1] >= 1.4 * detector.config.pattern.period:
         numbers, times = detector._recent()
         values, levels = detector._curves(numbers, rows, columns)
@@ -80,9 +88,15 @@ def explain_blink(detector: FlashDetector, shape: tuple[int, int]) -> FlashExpla
         for k, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
             u, v = _centre(row, column)
             why = _why_not(detector, matches, k, threshold)
-            triggers.append(Trigger(u, v, 4.0, passed=not why, note=f"alternation {change[int(v), int(u)]:.0f}"))
-            state: State = "undecided" if matches.score[k] < threshold else "refused"
-            clusters.append(Cluster(u, v, float(matches.score[k]), state, why or "will be a track"))
+            measured = {
+                "alternation": float(change[int(v), int(u)]),
+                "score": float(matches.score[k]),
+                "margin": float(matches.margin[k]),
+            }
+            triggers.append(Trigger(u, v, 4.0, not why, measured))
+            if k >= known:
+                state: State = "undecided" if matches.score[k] < threshold else "refused"
+                clusters.append(Cluster(u, v, float(matches.score[k]), state, why or "will be a track"))
     return FlashExplanation(np.asarray(change, np.float32), unit, tuple(triggers), tuple(clusters), threshold)
 
 
@@ -149,8 +163,9 @@ def explain_thesis(
         area = cv2.contourArea(contour)
         place = detector._trigger(contour)
         u, v = place if place is not None else middle
-        note = f"area {area:.0f} px, length {2 * radius:.1f} px"
-        triggers.append(Trigger(float(u), float(v), 2.0 * float(radius), place is not None, note))
+        length = 2.0 * float(radius)
+        measured = {"area": float(area), "length": length, "change": float(change[int(v), int(u)])}
+        triggers.append(Trigger(float(u), float(v), length, place is not None, measured))
     return FlashExplanation(
         np.maximum(change, 0).astype(np.float32), unit, tuple(triggers), tuple(clusters), 1.0 - config.max_cost
     )

@@ -7,7 +7,7 @@ belong to a label, red where to none; labels that were missed get a yellow squar
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -284,6 +284,39 @@ def plot(
                     cv2.circle(picture, point, 2, colour, -1, cv2.LINE_AA)
             cv2.putText(picture, name, (points[-1][0] - 40, points[-1][1] - 6), FONT, 0.36, colour, 1, cv2.LINE_AA)
     return picture
+
+
+def histograms(measured: Mapping[str, tuple[Sequence[float], Sequence[float]]], size: tuple[int, int]) -> Picture:
+    """Of each quantity the values on labels (blue, upwards) and elsewhere (orange, downwards), one plot under another.
+
+    Bars are shares of their own total, so that few labels can be compared with much clutter; ends are the first and
+    the 99th percentile of both.
+    """
+    plots = []
+    for name, (on_label, elsewhere) in measured.items():
+        width, height = size
+        picture = np.full((height, width, 3), 24, np.uint8)
+        both = np.array([*on_label, *elsewhere])
+        counts = f"{len(on_label)} on labels (blue), {len(elsewhere)} elsewhere (orange)"
+        cv2.putText(picture, f"{name}: {counts}", (AXIS, 18), FONT, 0.45, WHITE, 1, cv2.LINE_AA)
+        if len(both):
+            low, high = (float(value) for value in np.percentile(both, [1.0, 99.0]))
+            high = max(high, low + 1e-6)
+            edges = np.linspace(low, high, 61)
+            middle, reach = (28 + height - 22) // 2, (height - 50) // 2
+            for values, colour, sign in ((on_label, SKY, -1), (elsewhere, ORANGE, 1)):
+                if not len(values):
+                    continue
+                shares = np.histogram(np.clip(values, low, high), edges)[0] / len(values)
+                for k, share in enumerate(shares / max(float(shares.max()), 1e-9)):
+                    left, right = (AXIS + round((width - AXIS - 10) * (k + side) / 60) for side in (0, 1))
+                    tip = middle + sign * round(reach * float(share))
+                    cv2.rectangle(picture, (left, middle), (right - 2, tip), colour, -1)
+            for value in _ticks(low, high, 10):
+                x = AXIS + round((width - AXIS - 10) * (value - low) / (high - low))
+                cv2.putText(picture, f"{value:g}", (x - 8, height - 6), FONT, 0.36, GREY, 1, cv2.LINE_AA)
+        plots.append(picture)
+    return np.vstack(plots)
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:

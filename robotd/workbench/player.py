@@ -10,6 +10,7 @@ from typing import TextIO
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..clock import in_thread, now
 from ..errors import InputError
@@ -19,7 +20,7 @@ from ..records import Flash
 from ..vision.figures import Picture
 from .detectors import Detector
 from .pictures import Seen, overlay
-from .sequence import Tagged
+from .sequence import Tagged, tags_at
 
 ZOOM = 2.0
 
@@ -90,8 +91,7 @@ class Player:
 
 def seen_at(tagged: Tagged, shot: Shot, flashes: list[Flash] | None) -> Seen:
     """Marks that hold at a frame, and findings so far."""
-    tags = [tag for tag in tagged.tags if tag.since <= shot.t and (tag.until is None or shot.t <= tag.until)]
-    return Seen(tags, flashes)
+    return Seen(tags_at(tagged.tags, shot.t), flashes)
 
 
 def _fed(
@@ -131,6 +131,16 @@ def write_video(path: Path, tagged: Tagged, detector: Detector | None, since: fl
         if writer is not None:
             writer.release()
     return count
+
+
+def mean_picture(tagged: Tagged) -> NDArray[np.uint8]:
+    """The mean of the first 60 frames, in which walkers and noise are faint."""
+    images: list[NDArray[np.uint8]] = []
+    for _, shot in tagged.frames():
+        images.append(shot.image)
+        if len(images) == 60:
+            break
+    return np.asarray(np.rint(np.mean(images, axis=0, dtype=np.float32)), dtype=np.uint8)
 
 
 def write_picture(path: Path, picture: Picture) -> None:

@@ -19,6 +19,7 @@ from .tags import Tag, load_tags, moved, tags_path
 
 WHOLE = 0.8  # a mark that holds for so much of a clip counts in it; one that holds for less is not judged there
 SHORT = 0.75  # of a clip: a shorter rest of the footage is left out
+REACH = 1.5  # px by which a trigger's middle may be off
 FIRST = 2  # frames that a detector needs
 
 Make = Callable[["Tagged"], Detector]
@@ -213,6 +214,44 @@ class _Clip:
         )
 
 
+def tags_at(tags: Sequence[Tag], t: float) -> list[Tag]:
+    """The marks that hold at `t` seconds."""
+    return [tag for tag in tags if tag.since <= t and (tag.until is None or t <= tag.until)]
+
+
 def shifted(tags: Sequence[Tag], seconds: float) -> list[Tag]:
     """The marks in footage that begins so much later, without those that are over by then."""
     return [moved(tag, seconds) for tag in tags if tag.until is None or tag.until > seconds]
+
+
+# ---- what detectors measure at labels and elsewhere ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One trigger: what the detector measured, and whether it lay on a marked label."""
+
+    t: float
+    on_label: bool
+    passed: bool
+    values: dict[str, float]
+
+
+def measure(tagged: Tagged, detector: Detector, since: float = 0.0, until: float = math.inf) -> list[Measured]:
+    """Every trigger of a detector at its decisions; those in places that are not judged are left out.
+
+    Thesis section 6.3.2 and figure 25: all that passes the threshold beside what lies on true labels.
+    """
+    found: list[Measured] = []
+    for step in steps(tagged, detector, since, until):
+        if not step.decided:
+            continue
+        tags = [
+            tag for tag in tagged.tags if tag.since <= step.shot.t <= (math.inf if tag.until is None else tag.until)
+        ]
+        for trigger in detector.explain().triggers:
+            near = [tag for tag in tags if math.hypot(tag.u - trigger.u, tag.v - trigger.v) < tag.radius + REACH]
+            if any(tag.kind != "label" for tag in near):
+                continue
+            found.append(Measured(step.shot.t, bool(near), trigger.passed, trigger.values))
+    return found
