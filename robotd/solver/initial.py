@@ -30,6 +30,7 @@ FLOOR_M = -0.10  # a point lower than this is a reflection in the floor that the
 _FALLBACK_M = 1.5  # along the first ray of a label that cannot be triangulated
 _MOST_PAIRS = 190  # all pairs of 20 rays; more only repeat what those say
 _LEAST_PARALLAX = np.radians(0.3)
+_GRID_PAIRS = 20  # of a move's ray pairs, to search its grid with
 _NEGLIGIBLE = 1e-3  # decrease of a move's loss
 _RAY_SIGMA = 0.01  # rad: tilt and calibration, which the epipolar step does not know
 
@@ -175,9 +176,11 @@ def epipolar_moves(problem: Problem, sightings: Sightings, guess: Floats | None 
     if len(owner) == 0:
         return guess.copy()
     rays = _RayPairs(sightings, a, b, owner, len(moves.before))
+    few = max(1, len(owner) // (_GRID_PAIRS * len(moves.before)))
+    some = _RayPairs(sightings, a[::few], b[::few], owner[::few], len(moves.before)) if few > 1 else rays
     root = np.linalg.inv(np.linalg.cholesky(moves.covariance))
 
-    def losses(move: Floats) -> Floats:
+    def losses(move: Floats, rays: _RayPairs = rays) -> Floats:
         prior = ((root @ (move - moves.measured)[:, :, None]) ** 2).sum(axis=(1, 2))
         return np.asarray(rays.losses(move) + 9.0 * np.log1p(prior / 9.0))
 
@@ -185,15 +188,16 @@ def epipolar_moves(problem: Problem, sightings: Sightings, guess: Floats | None 
     distance = np.maximum(np.hypot(guess[:, 0], guess[:, 1]), 0.05)
     widest = np.maximum(3.0 * sigma[:, 2], 0.15)
     sideways = np.minimum(np.maximum(3.0 * sigma[:, 1] / distance, 0.1), 1.2)
-    best, lowest = guess.copy(), losses(guess)
+    best, lowest = guess.copy(), losses(guess, some)
     for turn in np.linspace(-1.0, 1.0, 9):
         for side in np.linspace(-1.0, 1.0, 5):
             trial = guess.copy()
             trial[:, :2] = (heading_matrix(side * sideways) @ trial[:, :2, None])[:, :, 0]
             trial[:, 2] += turn * widest
-            cost = losses(trial)
+            cost = losses(trial, some)
             best[cost < lowest] = trial[cost < lowest]
             lowest = np.minimum(cost, lowest)
+    lowest = losses(best)
     damping, idle = np.full(len(moves.before), 1e-3), 0
     for _ in range(18):
         trial = best + _epipolar_step(rays, best, moves.measured, root, damping)
@@ -228,7 +232,7 @@ class _RayPairs:
     """Pairs of rays, by the move that leads from the stop of one to that of the other."""
 
     def __init__(self, sightings: Sightings, first: Ints, second: Ints, owner: Ints, moves: int) -> None:
-        self.first, self.second, self.owner = first, second, owner
+        self.first, self.second, self.owner = np.ascontiguousarray(first), np.ascontiguousarray(second), owner
         self.begins: Ints = np.searchsorted(owner, np.arange(moves + 1))
         self.origin, self.direction = np.ascontiguousarray(sightings.origin), np.ascontiguousarray(sightings.direction)
         a, b = first, second

@@ -190,10 +190,11 @@ def _share(optimum: Optimum) -> float:
     """
     problem, s = optimum.problem, optimum.problem.sightings
     seen = stops_per_label(s.label, s.stop, len(problem.labels))[s.label] >= 2
-    groups = np.unique(s.rival[seen])
-    if len(groups) < _LEAST_LIGHTS:
+    lights = np.bincount(s.rival[seen]) > 0
+    if np.count_nonzero(lights) < _LEAST_LIGHTS:
         return 1.0
-    return float(np.isin(groups, s.rival[seen & (optimum.inlier | optimum.reflected)]).mean())
+    fits = np.bincount(s.rival[seen & (optimum.inlier | optimum.reflected)], minlength=len(lights)) > 0
+    return float(np.count_nonzero(fits) / np.count_nonzero(lights))
 
 
 def _misfit(asked: Problem, share: float) -> str:

@@ -27,6 +27,7 @@ _WRONG_KNOWN = 25.0
 _REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tell them apart, slack on the lens
 _EXPLAINED = 0.25  # weight of a sighting under that loss from which it counts as explained
 _ENOUGH = 20  # sightings at a stop, to begin with
+_FEW_DOUBTS = 0.001  # share of sightings not explained, below which labels are not triangulated once more
 _CLEAN = 0.97  # share of sightings explained at which no other start can do better
 _SAME = 0.5  # difference of two starts' costs below which they found the same minimum
 _FLOOR_IMAGE_PX = 6.0
@@ -100,13 +101,14 @@ def _best_start(
     guess = problem.moves.measured
     if start is not None:
         guess = se2_relative(start[problem.moves.before], start[problem.moves.after])
+    few = _thinned(problem)
     for schedule in (None, *_SCHEDULES) if grown is not None else _SCHEDULES:
         if schedule is None:
             assert grown is not None
             placement = grown
         else:
             moves = epipolar_moves(problem, problem.sightings, guess) if schedule.epipolar else guess
-            placement = place(problem, moves, schedule.tolerance)
+            placement = place(few, moves, schedule.tolerance)
             if not placement.placed.any():
                 # only outside references can leave every stop without a place
                 problem = at_first_stop(
@@ -114,7 +116,8 @@ def _best_start(
                     f"the {problem.frame} could not be matched with the sightings, so the first stop fixes the world "
                     "frame; check their positions and names",
                 )
-                placement = place(problem, moves, schedule.tolerance)
+                few = _thinned(problem)
+                placement = place(few, moves, schedule.tolerance)
         solution, spent = _descend(problem, placement, () if schedule is None else schedule.losses)
         iterations += spent
         cost = solution.cost + 1e6 * np.count_nonzero(~placement.placed)
@@ -131,9 +134,10 @@ def _descend(problem: Problem, placement: Placement, losses: tuple[Loss, ...]) -
     attached = detach(problem, placement.placed)
     adjustment = Adjustment(attached, attached.sightings)
     state, iterations, count = placement.state, 0, len(attached.sightings)
-    few = _thinned(attached, adjustment)
+    few = _thinned(attached)
+    first = adjustment if few is attached else Adjustment(few, few.sightings)
     for loss in losses:
-        solution = few.solve(state, loss, iterations=12, tolerance=max(1.0, 1e-4 * count))
+        solution = first.solve(state, loss, iterations=12, tolerance=max(1.0, 1e-4 * count))
         state, iterations = solution.state, iterations + solution.iterations
     everywhere = np.ones(problem.stop_count, dtype=np.bool_)
     for k, loss in enumerate(_TAIL):
@@ -141,6 +145,8 @@ def _descend(problem: Problem, placement: Placement, losses: tuple[Loss, ...]) -
             state, _ = retriangulate(attached, state, ray_tolerance(attached), everywhere)
         elif k == 1:
             doubtful = attached.sightings.label[_weights(adjustment, state) < _EXPLAINED]
+            if len(doubtful) < _FEW_DOUBTS * count:
+                continue  # the next loss will do; `_finish` looks for other places of labels once more
             state, _ = retriangulate(attached, state, ray_tolerance(attached), everywhere, np.unique(doubtful))
         last = k == len(_TAIL) - 1
         tolerance = max(1e-2, 1e-5 * count) if last else max(0.3, 1e-4 * count)
@@ -149,12 +155,12 @@ def _descend(problem: Problem, placement: Placement, losses: tuple[Loss, ...]) -
     return solution, iterations
 
 
-def _thinned(problem: Problem, adjustment: Adjustment) -> Adjustment:
+def _thinned(problem: Problem) -> Problem:
     """Every so many of the labels, where stops see many: as many as it takes to straighten the path."""
     stride = len(problem.sightings) // (_ENOUGH * problem.stop_count)
     if stride < 2:
-        return adjustment
-    return Adjustment(problem, problem.sightings.select(problem.sightings.label % stride == 0))
+        return problem
+    return replace(problem, sightings=problem.sightings.select(problem.sightings.label % stride == 0))
 
 
 def ray_tolerance(problem: Problem) -> float:
