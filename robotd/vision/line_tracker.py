@@ -32,6 +32,7 @@ KEY_DISTANCE, KEY_TURN = 0.08, 0.12  # metres and radians between two views whos
 KEY_LONGEST = 1.5  # seconds between them
 ENDED = 5  # frames in a row that must show the line's end
 TIP = 0.10  # metres remembered beyond what is seen that are cut off after as many frames
+SURE_TURN = 0.15  # rad/s: what encoders show below it is as much their steps as the robot's turning
 BESIDE = 0.15  # metres around an end in which any other piece of line is a doubt about it
 
 
@@ -347,7 +348,10 @@ class LineTracker:
         on, normal = match.on, match.normal[match.on]
         arm = sight.points[on] - np.array([pose.x, pose.y])
         lever = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
-        late = -(normal * sight.velocity[on]).sum(axis=1)
+        # Of a stamp's error only what turning shows counts, because along the way a view carries marks of its own with
+        # it, the end of what is seen above all, and these look like a late stamp.
+        turning = self._now.turn_rate
+        late = -lever * (turning if abs(turning) >= SURE_TURN else 0.0)
         H = np.column_stack([normal, lever, late, late])  # the constant error of the stamps, and this one's own
         residual, noise = match.offset[on], sight.across_sigma(match.normal, config.point_sigma)[on]
         prior = np.zeros((5, 5))
