@@ -36,6 +36,7 @@ from robotd.vision.polyline import arc_length
 FIRST_SIGHT_S = 3.0  # a standing robot waits this long for a line
 STANDSTILL_M_S = 0.002
 STANDSTILL_S = 0.15  # longer than the window over which odometry takes its speed
+SEARCH_LEAST = 0.15  # metres of remembered line in view that are worth a closer look
 SEARCH_NEAR = 0.10  # metres to either side of the prediction
 END_SLACK = 0.10  # metres before a stop at which the line may end: odometry's error after a long drive
 MARK_NEAR, MARK_FAR = 1.0, 0.30  # line widths and metres from the line's middle between which a marker is ours
@@ -243,7 +244,7 @@ class LineFollowerDriver(Driver):
             return self._searching(state, lost, steering), None
         if self._lost.is_turning:
             self._lost.forget()
-        if lost > SLOW_AFTER:
+        if tracker.missed(state.travelled) > SLOW_AFTER:
             self._enter("coasting")
         if steering.speed > 0.0:
             return steering, None
@@ -341,7 +342,7 @@ class LineFollowerDriver(Driver):
             return "tracking"
         if len(tracker.path) == 0:
             return None
-        if tracker.expected >= tracker.config.expected:
+        if tracker.expected >= SEARCH_LEAST:
             if tracker.see(await in_thread(self._eye.search, tracker.around(SEARCH_NEAR)), relaxed=True):
                 return "searching near"
             if tracker.see(await in_thread(self._eye.search), relaxed=True, everywhere=True):

@@ -56,7 +56,7 @@ class TrackerConfig:
     travel_noise: float = 0.003  # of each wheel after one metre
     independent: float = 8.0  # points of one frame that count as independent
     memory: float = 12.0  # frames after which a remembered point averages no more
-    expected: float = 0.15  # metres of remembered line in view without which it is no loss to see none
+    expected: float = 0.30  # metres of remembered line in view without which it is no loss to see none
     latency: float = 0.06  # metres driven until a frame arrives
     fork: Rule = "straight"
     fork_heading: float = 0.0  # for that rule, odometry axes
@@ -129,17 +129,22 @@ class LineTracker:
     def ends(self) -> bool:
         return self._ends >= ENDED
 
-    def lost(self, travelled: float) -> float:
-        """Metres driven while the line should have been in view but was not, also if frames stopped coming.
+    def missed(self, travelled: float) -> float:
+        """Metres driven while the line should have been in view but was not, also if frames stopped coming."""
+        if self._last is None:
+            return 0.0
+        return self._lost + max(0.0, travelled - self._last.travelled - self.config.latency)
 
-        What has been driven since any sight of the line counts too, beyond the blind zone that a sight covers.
+    def lost(self, travelled: float) -> float:
+        """Metres driven on memory alone: `missed`, or all since any sight of the line but for the blind zone.
+
+        In a tight corner the line leads out of view before it comes back, so that it is lost but not missed.
         """
         if self._last is None:
             return 0.0
-        silent = max(0.0, travelled - self._last.travelled - self.config.latency)
         beyond = travelled - self._sighted - self._blind
         # sights are older than they were noticed: the safety layer, which counts from their stamps, must not be first
-        return max(self._lost + silent, beyond + self.config.latency if beyond > 0.0 else 0.0)
+        return max(self.missed(travelled), beyond + self.config.latency if beyond > 0.0 else 0.0)
 
     def observe(self, lines: Sequence[Line], t: float, history: PoseHistory, travelled: float) -> bool:
         """Take a frame with one look at it: `begin`, `see` and `finish`; whether our line was among `lines`."""
