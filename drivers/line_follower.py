@@ -50,7 +50,7 @@ class LineFollowerConfig:
     camera: str = "floor"
     line_width: float = ranged(0.050, minimum=0.005, maximum=0.2)
     color: Literal["dark", "bright", "both"] = "dark"
-    cruise: float = ranged(0.22, minimum=0.03, maximum=0.30)
+    cruise: float = ranged(0.30, minimum=0.03, maximum=0.30)
     acceleration: float = ranged(0.30, minimum=0.05, maximum=0.5)
     corner_cut: float = ranged(0.0, minimum=0.0, maximum=1.0)
     corridor: float = ranged(0.050, minimum=0.0, maximum=0.2)

@@ -13,6 +13,7 @@ from robotd.drivers.line_follower import LineFollowerConfig, LineFollowerDriver
 from robotd.drivers.roomba import RoombaConfig, RoombaDriver
 from robotd.drivers.v4l2 import V4l2Config, V4l2Driver
 
+from robotd import oi
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
 from robotd.control import ControlLoop
@@ -45,6 +46,7 @@ class Drive:
     motions: list
     stops: list
     line_points: list
+    sent: list  # (loop time, right, left) of each drive command on the wire, mm/s
 
     @property
     def pose(self):
@@ -64,10 +66,37 @@ def store(points, *, closed=False, radius=0.0, width=0.05, color="dark", texture
     ), -low
 
 
-async def _drive(layout, targets, *, settings, seed, config, spoil, at_marker, camera, limits, until):
+class _Ear:
+    """Listens to what the driver sends to the base, byte by byte."""
+
+    def __init__(self):
+        self.sent = []
+        self._decoder = oi.CommandDecoder()
+
+    def frame(self, frame, delivered):
+        pass
+
+    def serial(self, port, t, data, *, to_robot):
+        for command in self._decoder.feed(data) if to_robot else ():
+            if isinstance(command, oi.Command) and command.name == "drive_direct":
+                self.sent.append((t, *command.values))
+
+
+def _halved(camera):
+    """A camera with half the pixels on each side."""
+    fx, fy, cx, cy = camera.matrix
+    width, height = camera.size
+    matrix = (fx / 2, fy / 2, (cx + 0.5) / 2 - 0.5, (cy + 0.5) / 2 - 0.5)
+    return dataclasses.replace(camera, size=(width // 2, height // 2), matrix=matrix)
+
+
+async def _drive(layout, targets, *, settings, seed, config, spoil, at_marker, camera, limits, until, halved):
     with tempfile.TemporaryDirectory() as folder:
         world = World(layout, settings, seed, Path(folder))
-        hardware, bus, calibration = SimHardware(world), Bus(), world.believed_calibration()
+        if halved:
+            world.rig = tuple(_halved(model) for model in world.rig)
+        ear = _Ear()
+        hardware, bus, calibration = SimHardware(world, ear), Bus(), world.believed_calibration()
         base = RoombaDriver("base", RoombaConfig(FOLDER + "base"), hardware, bus, calibration)
         eye = V4l2Driver(camera, V4l2Config(FOLDER + camera), hardware, bus, calibration)
         follower = LineFollowerDriver("follower", config, hardware, bus, calibration)
@@ -76,7 +105,7 @@ async def _drive(layout, targets, *, settings, seed, config, spoil, at_marker, c
         control = ControlLoop(bus, base, odometry, gate)
         if spoil is not None:
             _spoil(bus, camera, spoil)
-        drive = Drive(world, follower, None, 0.0, 0.0, 0.0, {}, [], [], [], [])
+        drive = Drive(world, follower, None, 0.0, 0.0, 0.0, {}, [], [], [], [], ear.sent)
         async with asyncio.TaskGroup() as group:
             supervisors = [Supervisor(driver) for driver in (base, eye, follower)]
             tasks = [group.create_task(control.run()), *(group.create_task(item.run()) for item in supervisors)]
@@ -147,9 +176,13 @@ def drive(
     camera="floor",
     limits=None,
     until=None,
+    halved=False,
     **keys,
 ):
-    """Follow a layout's line to each target in turn (metres from its first stop); `keys` configure the follower."""
+    """Follow a layout's line to each target in turn (metres from its first stop); `keys` configure the follower.
+
+    `halved` gives the rig cameras half the pixels on each side, for speed.
+    """
     keys = {"camera": camera, "line_width": layout.line.width, "color": layout.line.color} | keys
     config = LineFollowerConfig(**keys)
     return run_virtual(
@@ -164,5 +197,6 @@ def drive(
             camera=camera,
             limits=limits or SafetyLimits(),
             until=until,
+            halved=halved,
         )
     )

@@ -1,6 +1,5 @@
 """The line follower on the simulator's base and camera: bounds, markers, ends, other cameras; and its parts alone."""
 
-import dataclasses
 import math
 
 import cv2
@@ -13,7 +12,6 @@ from robotd.drive_path import drive_path, taut
 from robotd.geometry.transforms import rotation_vector
 from robotd.lost_line import TURN_MOST, LostLine, last_side
 from robotd.records import CameraModel, Pose, Transform
-from robotd.sim.layout import Mark
 from robotd.sim.world import looking
 from robotd.vision.line_eye import LineEye
 from robotd.vision.line_sight import to_robot
@@ -27,7 +25,7 @@ from tests.line_course import drive, store
 def corner():
     """Once round a right angle at 0.3 m/s on concrete."""
     layout, _ = store([(0.0, 0.0), (1.0, 0.0), (1.0, 0.9)], texture="concrete")
-    return drive(layout, [1.7], seed=3, cruise=0.3), layout
+    return drive(layout, [1.7], seed=3), layout
 
 
 def test_a_right_angle_is_followed_within_the_bounds_at_full_speed(corner):
@@ -47,10 +45,9 @@ def test_the_stamps_error_is_learned_in_one_corner(corner):
 def test_motion_by_the_line_is_as_wrong_as_its_information_says(corner):
     result, _ = corner
     body = result.world.body
-    late = 0.005 - result.world.camera_offset("floor") - result.driver.tracker.stamp_error
     squares, dimensions = 0.0, 0
     for motion in result.motions:
-        one, two = body.trail_at(motion.t0 + late), body.trail_at(motion.t1 + late)
+        one, two = body.trail_at(motion.t0), body.trail_at(motion.t1)
         (dx, dy), turn = (
             to_robot(np.array([[two.x, two.y]]), one)[0],
             math.remainder(two.heading - one.heading, math.tau),
@@ -60,7 +57,7 @@ def test_motion_by_the_line_is_as_wrong_as_its_information_says(corner):
         squares += error @ information @ error
         dimensions += np.linalg.matrix_rank(information, tol=1e-3, hermitian=True)
     assert dimensions > 20
-    assert 0.05 < squares / dimensions < 2.5
+    assert 0.4 < squares / dimensions < 2.5
 
 
 def test_the_stitched_line_is_where_the_tape_is(corner):
@@ -80,26 +77,12 @@ def test_states_tell_of_the_blind_corner_and_of_standing_at_the_end(corner):
     assert all(0.0 <= status.confidence <= 1.0 for status in result.states)
 
 
-def test_the_robot_stops_at_squares_and_dots_beside_the_line_and_at_its_end():
-    layout, shift = store([(0.0, 0.0), (1.9, 0.0)], texture="concrete")
-    marks = tuple(
-        Mark((float(x + shift[0]), float(y + shift[1])), shape=shape)
-        for x, y, shape in ((0.8, 0.14, "square"), (1.3, -0.15, "dot"))
-    )
-    layout = dataclasses.replace(layout, marks=marks)
-    result = drive(layout, [math.inf] * 3, seed=1, at_marker=True)
-    assert result.fault is None
-    assert [reason for reason, _, _ in result.stops] == ["marker", "marker", "end"]
-    for (_, _, pose), x in zip(result.stops, (0.8, 1.3, 1.9), strict=True):
-        assert pose.x - shift[0] == pytest.approx(x, abs=0.03)
-
-
 def test_the_front_camera_of_the_rig_does_instead_of_a_floor_camera():
-    layout, _ = store([(0.0, 0.0), (1.4, 0.0), (1.4, 0.8)], radius=0.3, texture="concrete")
-    result = drive(layout, [1.2], seed=0, camera="front")
+    layout, _ = store([(0.0, 0.0), (0.9, 0.0), (0.9, 1.6)], radius=0.3, texture="concrete")
+    result = drive(layout, [1.2], seed=0, camera="front", halved=True)
     assert result.fault is None
     assert result.driver.blind > 0.55
-    assert result.driver.mode.size == (640, 480)
+    assert result.driver.mode.size == result.world.rig[0].size
     assert result.cross_track["rms"] < 20.0
 
 

@@ -223,6 +223,21 @@ def test_the_error_of_the_stamps_is_learned_where_turns_begin_and_end(stamp_erro
     assert distance_to(near, path).max() < 0.008
 
 
+def test_neither_the_end_of_the_view_nor_steps_of_the_encoders_look_like_late_stamps():
+    rng, history, path = np.random.default_rng(0), PoseHistory(9.0), line_along_x(length=8.0)
+    for k in range(540):
+        history.add(0.015 * k, Pose(0.003 * k, 0.0, 0.0019 * rng.integers(-1, 2)))  # one wheel's count came first
+
+    def lines(pose):
+        (line,) = seen(path, Pose(pose.x, 0.0, 0.0), 0.001, int(1e6 * pose.x))
+        pull = np.concatenate([np.zeros(len(line.points) - 6), np.linspace(0.0, 2.0, 6)])  # px, where the view ends
+        return [Line(line.points + pull[:, None] * [1.0, 0.0], line.width, line.confidence)]
+
+    tracker = LineTracker(VIEW)
+    drive(tracker, None, history, np.arange(0.1, 8.0, 1 / 30), lines=lines)
+    assert abs(tracker.stamp_error) < 0.005
+
+
 def test_frames_from_unknown_times_change_nothing():
     tracker, history = LineTracker(VIEW), straight_history()
     assert not tracker.observe(seen(line_along_x(), Pose(0, 0, 0)), 99.0, history, 0.0)
@@ -306,6 +321,9 @@ def test_lines_found_with_relaxed_limits_keep_us_on_the_line_but_do_not_prolong_
 # ---- what the line says about the robot's motion ---------------------------------------------------------------------
 
 
+SIGMAS = {"point_sigma": 0.001, "whole": (0.0, 0.0), "jitter": 0.0, "late": 0.0}
+
+
 def views(path, first, second, *, noise=0.0, seed=0):
     rng = np.random.default_rng(seed)
     found = []
@@ -321,7 +339,7 @@ def views(path, first, second, *, noise=0.0, seed=0):
 def test_a_straight_line_shows_sideways_motion_and_turning_but_says_nothing_along_itself():
     true = Pose(0.06, 0.004, 0.02)
     one, two = views(line_along_x(length=3.0), Pose(0, 0, 0), true)
-    moved, information = motion_between(one, two, Pose(0.05, 0.0, 0.0), point_sigma=0.001, jitter=0.0, independent=8.0)
+    moved, information = motion_between(one, two, Pose(0.05, 0.0, 0.0), independent=8.0, **SIGMAS)
     assert moved.x == pytest.approx(0.05, abs=0.002)  # odometry's, because the line does not know better
     assert moved.y == pytest.approx(0.004, abs=1e-3)
     assert moved.heading == pytest.approx(0.02, abs=1e-4)
@@ -337,7 +355,7 @@ def test_a_corner_shows_all_of_the_motion(x, y, heading):
     path = np.vstack([line_along_x(length=0.75), np.column_stack([np.full(60, 0.75), np.arange(0.0, 0.6, 0.01)])])
     true = Pose(0.06 + x, y, heading)
     one, two = views(path, Pose(0, 0, 0), true)
-    moved, information = motion_between(one, two, Pose(0.06, 0.0, 0.0), point_sigma=0.001, jitter=0.0, independent=8.0)
+    moved, information = motion_between(one, two, Pose(0.06, 0.0, 0.0), independent=8.0, **SIGMAS)
     assert np.allclose([moved.x, moved.y, moved.heading], [true.x, true.y, true.heading], atol=1e-3)
     assert np.linalg.eigvalsh(information)[0] > 1e4
 
@@ -347,18 +365,38 @@ def test_the_information_is_what_the_errors_of_many_motions_say():
     true, squares = Pose(0.06, 0.003, 0.02), []
     for seed in range(200):
         one, two = views(path, Pose(0, 0, 0), true, noise=0.001, seed=seed)
-        moved, information = motion_between(
-            one, two, Pose(0.055, 0.0, 0.015), point_sigma=0.001, jitter=0.0, independent=1e9
-        )
+        moved, information = motion_between(one, two, Pose(0.055, 0.0, 0.015), independent=1e9, **SIGMAS)
         error = np.array([moved.x - true.x, moved.y - true.y, moved.heading - true.heading])
         squares.append(error @ information @ error / 3.0)
     assert 0.6 < np.mean(squares) < 1.4
 
 
+def test_views_that_show_another_line_in_part_are_believed_less():
+    one, two = views(line_along_x(length=3.0), Pose(0, 0, 0), Pose(0.06, 0.0, 0.0))
+    bent = two.points + np.column_stack([np.zeros(len(two.points)), np.maximum(0.0, two.points[:, 0] - 0.8) * 0.2])
+    other = View(two.t, bent, two.sigma, two.toward, two.speed, two.turn_rate)
+    straight, doubtful = (
+        motion_between(one, view, Pose(0.06, 0, 0), independent=8.0, **SIGMAS)[1] for view in (two, other)
+    )
+    assert np.trace(doubtful) < 0.3 * np.trace(straight)
+
+
+def test_late_stamps_count_where_the_robot_changes_its_motion():
+    one, two = views(line_along_x(length=3.0), Pose(0, 0, 0), Pose(0.06, 0.0, 0.0))
+    turning = View(two.t, two.points, two.sigma, two.toward, 0.2, 0.6)
+    for second, sigma in ((two, 0.0), (turning, 0.03 * 0.6)):  # rad: 30 ms of 0.6 rad/s
+        alike, doubtful = (
+            motion_between(one, second, Pose(0.06, 0, 0), independent=8.0, **(SIGMAS | {"late": late}))[1]
+            for late in (0.0, 0.03)
+        )
+        added = np.linalg.pinv(doubtful, hermitian=True) - np.linalg.pinv(alike, hermitian=True)
+        assert math.sqrt(max(added[2, 2], 0.0)) == pytest.approx(sigma, abs=1e-4)
+
+
 def test_views_of_different_lines_tell_no_motion():
     one, _ = views(line_along_x(0.3), Pose(0, 0, 0), Pose(0, 0, 0))
     _, two = views(line_along_x(-0.3), Pose(0, 0, 0), Pose(0, 0, 0))
-    assert motion_between(one, two, Pose(0, 0, 0), point_sigma=0.001, jitter=0.0, independent=8.0) is None
+    assert motion_between(one, two, Pose(0, 0, 0), independent=8.0, **SIGMAS) is None
 
 
 def test_what_leaves_the_memory_is_handed_over_once_and_in_order():

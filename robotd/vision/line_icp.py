@@ -13,12 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..records import Floats, Pose
+from ..records import Floats, LineMotion, Pose
+from .line_sight import to_robot
 from .polyline import directions
 
 HUBER = 2.0  # standard deviations beyond which a residual counts less
 SLIPPED = 16.0  # chi squared of a correction that odometry's noise does not explain
-UNSEEN = 1000.0  # information (1 / m^2, headings at LEVER) below which a direction is not seen: 30 mm
+UNSEEN = 8000.0  # information (1 / m^2, headings at LEVER) below which a direction is not seen: 11 mm
+KEY_DISTANCE, KEY_TURN = 0.08, 0.12  # metres and radians between two views whose motion is reported
+KEY_LONGEST = 1.5  # seconds between them
 LEVER = 0.5  # m: heading times this is comparable with a displacement
 
 
@@ -115,7 +118,15 @@ class View:
 
 
 def motion_between(
-    one: View, two: View, odometry: Pose, *, point_sigma: float, jitter: float, independent: float
+    one: View,
+    two: View,
+    odometry: Pose,
+    *,
+    point_sigma: float,
+    whole: tuple[float, float],
+    jitter: float,
+    late: float,
+    independent: float,
 ) -> tuple[Pose, Floats] | None:
     """How the robot moved between two views of one line, by the line alone.
 
@@ -127,8 +138,12 @@ def motion_between(
         The motion as odometry has it: where the search starts, and what is returned where the line shows nothing.
     point_sigma : float
         Metres, of a point across the line.
+    whole : (shift, turn)
+        Metres and radians by which all of a view is off together: the floor's tilt, and turning while rows are read.
     jitter : float
         Seconds, of a stamp.
+    late : float
+        Seconds, one sigma of what both stamps are off by: it matters where the robot changes its motion.
     independent : float
         So many points of a view count as independent.
 
@@ -169,8 +184,63 @@ def motion_between(
             break
     # a late stamp moves the whole view along the robot's motion
     slid = np.array([math.cos(heading) * two.speed, math.sin(heading) * two.speed, two.turn_rate]) / scale
+    changed = slid - np.array([one.speed - one.turn_rate * y, one.turn_rate * x, one.turn_rate]) / scale
+    misfit = max(1.0, float(np.mean((residual / noise) ** 2)))  # of views that show different lines in part
     kept = vectors[:, seen]
-    shift = kept.T @ slid
-    covariance = np.diag(gain[seen]) + 2.0 * jitter**2 * np.outer(shift, shift)
+    shift, change = kept.T @ slid, kept.T @ changed
+    together = 2.0 * np.array([whole[0], whole[0], LEVER * whole[1]]) ** 2
+    covariance = misfit * np.diag(gain[seen]) + (kept.T * together) @ kept
+    covariance += 2.0 * jitter**2 * np.outer(shift, shift) + late**2 * np.outer(change, change)
     information = (kept @ np.linalg.inv(covariance) @ kept.T) / np.outer(scale, scale)
     return Pose(x, y, math.remainder(heading, 2.0 * math.pi)), 0.5 * (information + information.T)
+
+
+class LineOdometer:
+    """Motion by the line alone, from each view to the next one that is some way on.
+
+    Parameters
+    ----------
+    point_sigma, whole, jitter, independent
+        As `motion_between` takes them.
+    """
+
+    def __init__(self, point_sigma: float, whole: tuple[float, float], jitter: float, independent: float) -> None:
+        self._point_sigma = point_sigma
+        self._whole = whole
+        self._jitter = jitter
+        self._independent = independent
+        self._key: tuple[View, Pose] | None = None
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._key = None
+
+    def observe(self, view: View, pose: Pose, stamp_error: float, late: float) -> LineMotion | None:
+        """Take a view from where odometry has the robot at `pose`; returns the motion that it shows, if it is time.
+
+        `stamp_error` is added to the views' stamps; `late` is its standard deviation, both in seconds.
+        """
+        key, self._key = self._key, (view, pose)
+        if key is None or view.t - key[0].t > KEY_LONGEST:
+            return None
+        (before, start) = key
+        turn = math.remainder(pose.heading - start.heading, 2.0 * math.pi)
+        x, y = to_robot(np.array([[pose.x, pose.y]]), start)[0].tolist()
+        if math.hypot(x, y) < KEY_DISTANCE and abs(turn) < KEY_TURN:
+            self._key = key
+            return None
+        moved = motion_between(
+            before,
+            view,
+            Pose(x, y, turn),
+            point_sigma=self._point_sigma,
+            whole=self._whole,
+            jitter=self._jitter,
+            late=late,
+            independent=self._independent,
+        )
+        if moved is None or not moved[1].any():
+            return None
+        (a, b, c), (d, e, f), (g, h, i) = moved[1].tolist()
+        times = before.t + stamp_error, view.t + stamp_error
+        return LineMotion(*times, moved[0].x, moved[0].y, moved[0].heading, ((a, b, c), (d, e, f), (g, h, i)))

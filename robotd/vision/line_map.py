@@ -29,6 +29,8 @@ class LineMap:
     path : (N, 2) array
     missed : (N,) int array
         Frames in a row in which each point was in view but not seen.
+    shown : (N,) int array
+        Frames that have shown each point.
     """
 
     def __init__(self, spacing: float, memory: float, join: float) -> None:
@@ -42,6 +44,7 @@ class LineMap:
         self.path: Floats = np.empty((0, 2))
         self.weights: Floats = np.empty(0)
         self.missed = np.empty(0, dtype=np.int64)
+        self.shown = np.empty(0, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.path)
@@ -56,6 +59,7 @@ class LineMap:
         self.path = resample(points, self.spacing)
         self.weights = np.zeros(len(self.path))
         self.missed = np.zeros(len(self.path), dtype=np.int64)
+        self.shown = np.zeros(len(self.path), dtype=np.int64)
 
     def match(self, sight: Sight, within: float) -> Nearest | None:
         """Project a sight onto the line; None if less than three of its points are on it."""
@@ -114,6 +118,7 @@ class LineMap:
         """Count, after all sights of a frame are merged, the points that were in view but not seen."""
         seen = self.missed < 0
         self.missed = np.where(seen, 0, self.missed + (shown & ~seen))
+        self.shown = self.shown + seen
 
     def append(self, points: Floats, weight: float, join: float | None = None) -> bool:
         """Prolong it by points at least half a spacing from its end, also round a sharp corner; whether it grew.
@@ -128,6 +133,7 @@ class LineMap:
         self.path = np.vstack([self.path, added])
         self.weights = np.concatenate([self.weights, np.full(len(added), weight)])
         self.missed = np.concatenate([self.missed, np.full(len(added), -1)])
+        self.shown = np.concatenate([self.shown, np.zeros(len(added), dtype=np.int64)])
         return True
 
     def cut(self, s: float) -> None:
@@ -155,12 +161,14 @@ class LineMap:
             even = resample(self.path, self.spacing)
             wanted = np.linspace(0.0, lengths[-1], len(even))
             self.weights = np.interp(wanted, lengths, self.weights)
-            self.missed = self.missed[np.clip(np.searchsorted(lengths, wanted), 0, len(lengths) - 1)]
+            nearest_ones = np.clip(np.searchsorted(lengths, wanted), 0, len(lengths) - 1)
+            self.missed, self.shown = self.missed[nearest_ones], self.shown[nearest_ones]
             self.path = even
         return dropped
 
     def _keep(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> None:
-        self.path, self.weights, self.missed = self.path[keep], self.weights[keep], self.missed[keep]
+        self.path, self.weights = self.path[keep], self.weights[keep]
+        self.missed, self.shown = self.missed[keep], self.shown[keep]
 
     def end_direction(self) -> Floats:
         """Unit vector (2,) in which it ends."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..records import Floats, Line, LineMotion, Pose
 from .line_forks import STRAIGHT_ON, Junctions, Rule
-from .line_icp import SLIPPED, Nearest, View, motion_between, solve
+from .line_icp import SLIPPED, LineOdometer, Nearest, View, solve
 from .line_map import LineMap, approach
 from .line_sight import Motion, PoseHistory, Sight, sights, to_robot
 from .polyline import end_direction
@@ -28,11 +28,10 @@ from .top_view import TopView
 
 __all__ = ["LineTracker", "PoseHistory", "TrackerConfig"]
 
-KEY_DISTANCE, KEY_TURN = 0.08, 0.12  # metres and radians between two views whose motion is reported
-KEY_LONGEST = 1.5  # seconds between them
 ENDED = 5  # frames in a row that must show the line's end
-TIP = 0.10  # metres remembered beyond what is seen that are cut off after as many frames
+TIP = 0.10  # metres remembered beyond what is seen that are cut off after as many frames; more, if seen less often
 SURE_TURN = 0.15  # rad/s: what encoders show below it is as much their steps as the robot's turning
+MORE = 4  # frames in a row that must show how the line goes on behind an end that was seen
 BESIDE = 0.15  # metres around an end in which any other piece of line is a doubt about it
 
 
@@ -49,6 +48,8 @@ class TrackerConfig:
     join: float = 0.30  # longest gap between the memory's end and a piece that continues it
     clear: float = 0.32  # of bare floor seen beyond its end that make it an end
     point_sigma: float = 0.002  # of a seen point across the line
+    motion_sigma: float = 0.0007  # the same, between two views of one place
+    motion_whole: tuple[float, float] = (0.0005, 0.001)  # shift and turn of such a view as a whole
     tilt_sigma: float = 0.006  # of the floor against the camera: 0.3 degrees
     stamp_sigma: float = 0.03  # of the camera's constant stamp error
     jitter: float = 0.002  # of a stamp
@@ -94,6 +95,7 @@ class LineTracker:
         self._blind = float(view.to_robot(np.array([[0.0, view.valid.shape[0] - 1.0]]))[0, 0])
         self._map = LineMap(config.spacing, config.memory, config.join)
         self._junctions = Junctions(config.fork, config.fork_heading)
+        self._odometer = LineOdometer(config.motion_sigma, config.motion_whole, config.jitter, config.independent)
         self.stamp_error = 0.0
         self._covariance: Floats = np.diag([0.0, 0.0, 0.0, config.stamp_sigma**2])
         self.reset()
@@ -116,10 +118,10 @@ class LineTracker:
         self._sighted = 0.0  # metres travelled at the last sight
         self._last: Motion | None = None  # at the last frame
         self._now: Motion | None = None
-        self._t = 0.0
+        self._stamp = 0.0
         self._seen: Sight | None = None
-        self._ends = 0
-        self._key: tuple[View, Pose] | None = None
+        self._ends = self._more = 0
+        self._odometer.reset()
         self._finished: list[tuple[Floats, Floats]] = []
         self.confidence = 0.0
         self._motion: LineMotion | None = None
@@ -172,7 +174,7 @@ class LineTracker:
         if at is None:
             return False
         self._now = Motion(*at, travelled)
-        self._t = t + self.stamp_error
+        self._stamp = t
         self._seen = None
         self._predict(self._now.pose)
         return True
@@ -245,7 +247,7 @@ class LineTracker:
             return False
         self._map.start(np.vstack([approach(pose, best[1].points), best[1].points]))
         self._junctions.forget()
-        self._ends = 0
+        self._ends = self._more = 0
         self._note(best[1])
         return True
 
@@ -327,6 +329,7 @@ class LineTracker:
         line, config = self._map, self.config
         matches = [(match, sight) for sight in found if (match := line.match(sight, within)) is not None]
         matches.sort(key=lambda pair: -_covered(pair[0]))
+        grows = not relaxed and self._may_grow(found)
         for match, sight in matches:
             if _covered(match) < 3 * config.spacing:
                 break
@@ -335,8 +338,8 @@ class LineTracker:
                 self._note(sight)
             fresh = line.match(sight, config.match)
             if fresh is not None:
-                self._merge(fresh, sight, grow=not relaxed)
-        grown = [] if relaxed else [sight for sight in found if self._continue(sight)]
+                self._merge(fresh, sight, grow=grows)
+        grown = [sight for sight in found if self._continue(sight)] if grows else []
         if self._seen is None and grown:
             self._note(grown[0])
         if self._seen is None:
@@ -379,8 +382,33 @@ class LineTracker:
         if grow and end - match.along[last] < 1.5 * self.config.spacing:
             self._map.append(sight.points[last + 1 :], float(weight[match.on].min()))
 
+    def _may_grow(self, found: Sequence[Sight]) -> bool:
+        """Whether the memory's end is open: one that was seen is believed until several frames show more line."""
+        if not self.ends or not any(map(self._is_more, found)):
+            self._more = 0
+            return True
+        self._more += 1
+        if self._more >= MORE:
+            self._ends = self._more = 0
+        return self._more == 0
+
+    def _is_more(self, sight: Sight) -> bool:
+        if self._join(sight) is not None:
+            return True
+        match = self._map.match(sight, self.config.match)
+        if match is None:
+            return False
+        last = int(np.flatnonzero(match.on)[-1])
+        reaches = float(self._map.lengths[-1]) - match.along[last] < 1.5 * self.config.spacing
+        return reaches and float(np.hypot(*(sight.points[-1] - self.path[-1]))) > TIP
+
     def _continue(self, sight: Sight) -> bool:
         """Append a sight that goes on straight where the memory ends, across a gap."""
+        join = self._join(sight)
+        return join is not None and self._map.append(sight.points, 1.0 / self.config.point_sigma**2, join)
+
+    def _join(self, sight: Sight) -> float | None:
+        """Longest gap over which a sight may be joined to the memory's end; None if it does not go on from there."""
         gap = sight.points[0] - self.path[-1]
         out, into = self._map.end_direction(), -end_direction(sight.points[::-1], 0.1)
         distance = float(np.hypot(*gap))
@@ -388,11 +416,11 @@ class LineTracker:
         if not self._shown()[-1]:  # a gap that begins where nothing is seen: it may end where the view begins
             join += self._blind
         if distance > join or math.acos(np.clip(out @ into, -1.0, 1.0)) > STRAIGHT_ON:
-            return False
+            return None
         sideways = abs(out[0] * gap[1] - out[1] * gap[0])
         if out @ gap < -self.config.spacing or sideways > 0.02 + 0.25 * distance:
-            return False
-        return self._map.append(sight.points, 1.0 / self.config.point_sigma**2, join)
+            return None
+        return join
 
     def _look_ahead(self, found: Sequence[Sight]) -> None:
         """Take the way that the rule wants where there are several, and see whether the line ends."""
@@ -405,19 +433,19 @@ class LineTracker:
             line.append(branch.points, 1.0 / config.point_sigma**2)
         seen = np.flatnonzero(line.missed == 0)
         last = int(seen[-1]) if len(seen) else len(line) - 1
-        if (
-            last < len(line) - 1
-            and line.lengths[-1] - line.lengths[last] < TIP
-            and line.missed[last + 1 :].min() >= ENDED
-        ):
-            line.cut(float(line.lengths[last]))
+        if last < len(line) - 1:
+            missed, shown = line.missed[last + 1 :], line.shown[last + 1 :]
+            is_short = line.lengths[-1] - line.lengths[last] < TIP
+            if missed.min() >= ENDED and (is_short or (missed > shown).all()):
+                line.cut(float(line.lengths[last]))
         end, out = line.path[-1], line.end_direction()
         beyond = end + np.arange(0.03, config.clear, 0.02)[:, None] * out
-        bare = self.view.shows(to_robot(np.vstack([end, beyond]), pose)).all() and line.missed[-3:].max() <= 0
+        is_seen = len(seen) > 0 and line.missed[-4:].min() == 0  # to the end, but for a point or two
+        bare = is_seen and self.view.shows(to_robot(np.vstack([end, beyond]), pose)).all()
         bare = bare and not any(
             np.hypot(*(sight.points - end).T).min() < BESIDE and not self._is_ours(sight) for sight in found
         )
-        self._ends = self._ends + 1 if bare else 0 if line.missed[-3:].max() <= 0 else self._ends
+        self._ends = self._ends + 1 if bare else 0 if is_seen else self._ends
 
     def _is_ours(self, sight: Sight) -> bool:
         match = self._map.match(sight, self.config.match) or self._map.match(sight.reversed(), self.config.match)
@@ -433,40 +461,19 @@ class LineTracker:
     def _note(self, sight: Sight) -> None:
         """This is ours: keep it, and report the motion since the last view that is far enough back."""
         assert self._now is not None
-        now, config = self._now, self.config
+        now = self._now
         self._seen = sight
         self.confidence = sight.confidence
         view = View(
-            self._t,
+            self._stamp,
             to_robot(sight.points, now.pose),
             0.3 * sight.forward_sigma,  # because the floor's tilt hardly changes on the way
             to_robot(sight.view, Pose(0.0, 0.0, now.pose.heading)),
             now.speed,
             now.turn_rate,
         )
-        if self._key is None or self._t - self._key[0].t > KEY_LONGEST:
-            self._key = view, now.pose
-            return
-        key, pose = self._key
-        turn = math.remainder(now.pose.heading - pose.heading, 2.0 * math.pi)
-        at = to_robot(np.array([[now.pose.x, now.pose.y]]), pose)[0]
-        if math.hypot(*at) < KEY_DISTANCE and abs(turn) < KEY_TURN:
-            return
-        self._key = view, now.pose
-        moved = motion_between(
-            key,
-            view,
-            Pose(float(at[0]), float(at[1]), turn),
-            point_sigma=config.point_sigma,
-            jitter=config.jitter,
-            independent=config.independent,
-        )
-        if moved is not None and moved[1].any():
-            (a, b, c), (d, e, f), (g, h, i) = moved[1].tolist()
-            by_line = moved[0]
-            self._motion = LineMotion(
-                key.t, view.t, by_line.x, by_line.y, by_line.heading, ((a, b, c), (d, e, f), (g, h, i))
-            )
+        late = math.sqrt(self._covariance[3, 3])
+        self._motion = self._odometer.observe(view, now.pose, self.stamp_error, late) or self._motion
 
 
 def _covered(match: Nearest) -> float:
