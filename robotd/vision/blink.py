@@ -49,6 +49,7 @@ _FEW = 4  # frames since the last decision that are not worth another one
 _BLOCK = 32  # frames whose alternation fits into 16 bits: 32 * 63 * 63 / 4 < 2^15
 _LOW, _HIGH = 4.0, 1500.0  # a block's alternation counts no further than so many typical ones below, and this above
 _CLEAR = 1.8  # limits from which a place is clear enough to be examined at every decision
+_NO_SPOT = 12.0  # refusals that a place counts which follows the pattern but is no small light: it costs most
 _FORGET = 0.8  # of a place's refusals, from one decision to the next
 _TILE = (24, 32)  # cells over which the false alarm rate is held constant
 _BEFORE, _AFTER = 3, 5  # cells around an aperture's first one that its ring needs: 8x8 in all
@@ -76,7 +77,7 @@ class FlashConfig:
     max_width_px: float = ranged(2.5, minimum=0.5, doc="a light is no wider (sigma) than this")
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
     steady_hz: tuple[float, ...] = (1.0, 2.0, 5.0, 8.0, 10.0)
-    max_candidates: int = ranged(96, minimum=1, maximum=2000, doc="apertures examined at one decision")
+    max_candidates: int = ranged(72, minimum=1, maximum=2000, doc="apertures examined at one decision")
     max_reflection: float = ranged(0.65, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
 
     def min_score(self, shape: tuple[int, int]) -> float:
@@ -329,9 +330,10 @@ class FlashDetector:
         if t - self._times[0][1] < 1.4 * self.config.pattern.period:
             return
         rows, columns = self._candidates()
-        known = len(self.tracks)
-        rows = np.concatenate([np.array([track.row for track in self.tracks], np.intp), rows])
-        columns = np.concatenate([np.array([track.column for track in self.tracks], np.intp), columns])
+        due = [track for track in self.tracks if t - track.last >= 2.0 * self.config.pattern.period]
+        known = len(due)
+        rows = np.concatenate([np.array([track.row for track in due], np.intp), rows])
+        columns = np.concatenate([np.array([track.column for track in due], np.intp), columns])
         if not len(rows):
             return
         numbers, times = self._recent()
@@ -346,7 +348,8 @@ class FlashDetector:
         )
         for k in range(known):
             if accepted[k]:
-                self._extend(self.tracks[k], k, matches, t)
+                self._extend(due[k], k, matches, t)
+        self._refused *= _FORGET
         in_vain = np.flatnonzero(matches.score[known:] < 0.5 * least) + known
         self._refused[rows[in_vain], columns[in_vain]] += 1.0
         fresh = [k for k in np.argsort(-matches.light) if k >= known and accepted[k]]
@@ -371,13 +374,15 @@ class FlashDetector:
                 max(track.column - _SEPARATION, 0) : track.column + _SEPARATION + 1,
             ] = 0.0
         strength = np.maximum(total, clipped)
-        clear = self._peaks(np.where(over > _CLEAR, strength, np.float32(0.0)), 2 * self.config.max_candidates // 3)
+        clear = self._peaks(
+            np.where((over > _CLEAR) & (self._refused < 0.5 * _NO_SPOT), strength, np.float32(0.0)),
+            2 * self.config.max_candidates // 3,
+        )
         # what is weaker, or found no room among the strong, has its turn before what was examined in vain
         over *= over > 1.0
         over /= 1.0 + self._refused
         over.ravel()[clear] = 0.0
-        self._refused *= _FORGET
-        peaks = np.concatenate([clear, self._peaks(over, self.config.max_candidates - len(clear))])
+        peaks = np.concatenate([clear, self._peaks(over, self.config.max_candidates // 3)])
         rows, columns = np.divmod(peaks, total.shape[1])
         return np.ascontiguousarray(rows), np.ascontiguousarray(columns)
 
@@ -418,6 +423,7 @@ class FlashDetector:
                 return
             track = self._track(row, column, k, matches, t)
         if self.spot(track) is None:
+            self._refused[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = _NO_SPOT
             return
         places = np.array([(track.row, track.column) for track in self.tracks]).reshape(-1, 2)
         if not len(places) or np.min(np.hypot(places[:, 0] - row, places[:, 1] - column)) > _SEPARATION:
@@ -439,8 +445,7 @@ class FlashDetector:
             track.start = float(matches.start[k])
             track.light = float(matches.light[k])
             track.variance = float(matches.variance[k])
-        if t - track.last >= 2.0 * self.config.pattern.period:
-            self._grow(track, float(matches.start[k]), int(matches.periods[k]), t)
+        self._grow(track, float(matches.start[k]), int(matches.periods[k]), t)
 
     def _grow(self, track: Track, start: float, periods: int, t: float) -> None:
         """Add the frames since `track.last` to the amplitude image: per cell the regression of light on the pattern."""
