@@ -202,3 +202,17 @@ def test_ours_finds_more_than_the_thesis_and_less_that_is_not_there():
     assert ours.found >= 7
     assert ours.found > theirs.found > 0
     assert ours.precision >= theirs.precision
+
+
+@pytest.mark.parametrize(("reflections", "seconds"), [(False, 2.1), (True, 4.0)])
+def test_labels_of_the_thesis_s_table_are_found_in_two_seconds_and_their_reflections_are_not(reflections, seconds):
+    score = Score()
+    for number in (10, 13):
+        shown = scene(number, 1, Options(seconds=seconds, reflections=reflections))
+        film, stamps = frames(shown)
+        score.add(FlashDetector().detect(film, stamps), shown.labels, shown.mirrored)
+    swapped = 1 if reflections else 0  # a reflection may look like the lamp, and the lamp like its reflection
+    assert score.labels == 8
+    assert score.found >= 8 - swapped
+    assert score.false <= swapped
+    assert score.rms_px <= 0.06
