@@ -125,8 +125,12 @@ def _add_line(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     line.add_argument("--frames", type=_count, default=8, metavar="N", help="of a video or a camera (default: 8)")
     line.add_argument("--out", type=Path, default=Path("out/line"), metavar="DIR", help="default: out/line")
-    line.add_argument("--stages", action="store_true", help="also write each stage as a picture of its own")
-    line.add_argument("--compare", action="store_true", help="also show what thresholds, Canny + Hough and LSD find")
+    line.add_argument(
+        "--separate", action="store_true", help="also write each stage of each search as a picture of its own"
+    )
+    line.add_argument(
+        "--compare", action="store_true", help="a second sheet: what thresholds, Canny + Hough and LSD find"
+    )
     line.add_argument("--json", action="store_true", help="print the lines as one JSON object")
 
 

@@ -197,23 +197,30 @@ def _draw(
     sure: float,
 ) -> list[str]:
     """Write the sheets of one frame; returns the files."""
-    written = []
     seen = explain(detector, image, valid)
-    for one in seen:
-        which = f".{one.polarity}_{one.scale:.2g}x" if len(seen) > 1 else ""
-        pictures = figures.stages(image, valid, one, lines, sure)
-        written.append(_write(arguments.out / f"{name}{which}.png", figures.sheet(list(pictures.values()), 3)))
-        if arguments.stages:
-            for k, (stage, picture) in enumerate(pictures.items(), start=1):
-                written.append(_write(arguments.out / f"{name}{which}.{k}_{stage}.png", picture))
+    if not seen:  # too small for any line
+        return []
+    best = figures.shown(seen, lines)
+    pictures = figures.stages(image, valid, best, lines, sure)
+    least, greatest = best.width_px
+    title = (
+        f"{name}, {image.shape[1]} x {image.shape[0]} px: {best.polarity} lines {least:.1f} to {greatest:.1f} px wide"
+    )
+    if len(seen) > 1:
+        title += f", one of {len(seen)} searches (--separate: all)"
+    chosen = [pictures[stage] for stage in figures.SHEET]
+    written = [_write(arguments.out / f"{name}.png", figures.sheet(chosen, 3, title))]
     if arguments.compare:
-        least = 2.0 * math.sqrt(math.prod(arguments.width_px)) if arguments.width_px is not None else 40.0
-        for dark in {"dark": (True,), "bright": (False,), "both": (True, False)}[arguments.color]:
-            which = ("_dark" if dark else "_bright") if arguments.color == "both" else ""
-            beside = figures.rivals(image, valid, lines, sure, dark=dark, least_length=least)
-            written.append(
-                _write(arguments.out / f"{name}.compare{which}.png", figures.sheet(list(beside.values()), 3))
-            )
+        length = 2.0 * math.sqrt(math.prod(arguments.width_px)) if arguments.width_px is not None else 40.0
+        dark = best.polarity == "dark"
+        beside = figures.rivals(image, valid, lines, sure, dark=dark, least_length=length)
+        title = f"{name}: robotd and what common methods mark for a {best.polarity} line"
+        written.append(_write(arguments.out / f"{name}.compare.png", figures.sheet(list(beside.values()), 3, title)))
+    if arguments.separate:
+        for one in seen:
+            which = f".{one.polarity}_{one.scale:.2g}x" if len(seen) > 1 else ""
+            for k, (stage, picture) in enumerate(figures.stages(image, valid, one, lines, sure).items(), start=1):
+                written.append(_write(arguments.out / f"{name}{which}.{k}_{stage}.png", picture))
     return written
 
 

@@ -46,7 +46,7 @@ def test_an_image_gives_its_lines_and_a_sheet_of_pictures(tmp_path, capsys):
     assert np.abs(np.array(line["points_px"])[:, 0] - 150.0).max() < 0.3
     assert result["pictures"] == [str(tmp_path / "out" / "floor.png")]
     sheet = cv2.imread(result["pictures"][0])
-    assert sheet.shape[1] == 3 * (figures.PANEL + 8)
+    assert sheet.shape == (figures.HEAD + 2 * (figures.BAR + 420 + 8), 3 * (figures.PANEL + 8), 3)
 
 
 def test_no_line_is_a_result(tmp_path, capsys):
@@ -57,21 +57,28 @@ def test_no_line_is_a_result(tmp_path, capsys):
 
 def test_stages_and_the_comparison_are_pictures_of_their_own(tmp_path, capsys):
     source = save(tmp_path / "floor.png", tape())
-    assert main(["line", source, *TAPE, "--stages", "--compare", "--out", str(tmp_path / "out")]) == 0
+    assert main(["line", source, *TAPE, "--separate", "--compare", "--out", str(tmp_path / "out")]) == 0
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    stages = ("picture", "gradient", "edges", "strokes", "width", "direction", "score", "clusters", "lines")
+    stages = ("picture", "gradient", "borders", "strokes", "width", "direction", "score", "clusters", "lines")
     assert names == sorted(
         ["floor.png", "floor.compare.png", *(f"floor.{k}_{stage}.png" for k, stage in enumerate(stages, start=1))]
     )
     assert "16.0 px wide" in capsys.readouterr().err
 
 
-def test_each_colour_gets_its_own_sheet(tmp_path, capsys):
-    source = save(tmp_path / "floor.png", tape())
-    assert main(["line", source, "--width-px", "12,24", "--compare", "--json", "--out", str(tmp_path / "out")]) == 0
-    pictures = [Path(name).name for name in seen(capsys)[0]["pictures"]]
-    assert len([name for name in pictures if ".dark" in name]) == len([name for name in pictures if ".bright" in name])
-    assert {"floor.compare_dark.png", "floor.compare_bright.png"} <= set(pictures)
+@pytest.mark.parametrize("dark", [40, 230])
+def test_a_line_of_unknown_width_and_colour_gets_one_sheet_of_the_search_that_found_it(tmp_path, capsys, dark):
+    source = save(tmp_path / "floor.png", tape(dark=dark, floor=130))
+    assert main(["line", source, "--compare", "--json", "--out", str(tmp_path / "out")]) == 0
+    (result,) = seen(capsys)
+    assert [Path(name).name for name in result["pictures"]] == ["floor.png", "floor.compare.png"]
+    assert len(result["lines"]) == 1
+    detector = LineDetector(LineConfig("both"))
+    every = explain(detector, tape(dark=dark, floor=130))
+    assert len(every) >= 4
+    best = figures.shown(every, detector.detect(tape(dark=dark, floor=130)))
+    assert best.polarity == ("dark" if dark < 130 else "bright")
+    assert best.width_px[0] < 16.0 < best.width_px[1]
 
 
 def test_two_images_of_the_same_name_do_not_overwrite_each_other(tmp_path, capsys):

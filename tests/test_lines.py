@@ -280,9 +280,32 @@ def test_our_detector_finds_every_shape_on_a_mild_floor():
     assert summary.false_lines < 0.2
 
 
+@pytest.mark.parametrize(
+    ("family", "least"),
+    [
+        ("shape/horizontal", 0.99),
+        ("shape/upright_corner", 0.99),
+        ("shape/right_angle", 0.99),
+        ("shape/dashed", 0.8),
+        ("camera/contrast_40", 0.95),
+    ],
+)
+def test_our_detector_finds_horizontals_corners_dashes_and_low_contrast(family, least):
+    found = [scene(family, number, (320, 240), samples=2) for number in range(3)]
+    summary = summarise([score(one, OURS(one)) for one in found])
+    assert summary.loose >= least
+    assert summary.false_lines == 0.0
+
+
 def test_our_detector_bears_bad_light_and_a_bad_camera():
     summary = mean_of([name for name in FAMILIES if name.startswith(("light/", "camera/"))])
     assert summary.loose > 0.92
+
+
+def test_our_detector_finds_19_lines_of_20_over_all_families():
+    summary = mean_of([name for name in FAMILIES if not name.startswith("bare/")])
+    assert summary.loose >= 0.95
+    assert summary.false_lines < 0.05
 
 
 def test_our_detector_finds_nothing_on_most_bare_floors():

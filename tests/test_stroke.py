@@ -1,5 +1,8 @@
 """The line detector: accuracy in all directions, what it joins, what it refuses, and its kernels against numpy."""
 
+import tracemalloc
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -188,6 +191,31 @@ def test_a_reused_detector_gives_the_same_lines_and_keeps_its_buffers():
     detector.detect(np.full((H, W), 90, np.uint8))
     np.testing.assert_array_equal(detector.detect(first)[0].points, expected)
     assert {id(buffer) for buffer in detector._workspaces.values()} == buffers
+
+
+def test_frames_leave_no_memory_behind():
+    detector = LineDetector(LineConfig("both", (10, 20)))
+    frames = [draw([[(20 * k, 0), (100 + 20 * k, 239)]], 14, seed=k) for k in range(4)]
+    for frame in frames * 3:
+        detector.detect(frame)
+    tracemalloc.start()
+    try:
+        for frame in frames:
+            detector.detect(frame)
+        before, _ = tracemalloc.get_traced_memory()
+        for frame in frames * 10:
+            detector.detect(frame)
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 4096
+
+
+@pytest.mark.parametrize("name", ["stroke", "cluster", "polyline", "join", "measure"])
+def test_kernels_release_the_interpreter(name):
+    functions = (Path(__file__).parents[1] / "cython" / f"{name}.pyx").read_text().split("\ndef ")[1:]
+    assert functions
+    assert all("    with nogil:\n" in function for function in functions)
 
 
 @settings(deadline=None, max_examples=30)

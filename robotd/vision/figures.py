@@ -24,8 +24,10 @@ ORANGE, SKY, GREEN = (0, 159, 230), (233, 180, 86), (115, 158, 0)
 YELLOW, BLUE, RED, PURPLE = (66, 228, 240), (178, 114, 0), (0, 94, 213), (167, 121, 204)
 WHITE, BLACK, GREY = (255, 255, 255), (0, 0, 0), (128, 128, 128)
 CATEGORIES = (ORANGE, SKY, YELLOW, PURPLE, GREEN, RED, BLUE)
+DOUBTFUL = 0.05  # confidence from which a refused line is worth showing
 PANEL = 560  # width in pixels of one picture of a sheet
-BAR = 26  # height of its title
+BAR = 30  # height of its title
+HEAD = 40  # height of the title of a sheet
 
 
 class Canvas:
@@ -84,7 +86,7 @@ class Canvas:
     def titled(self, title: str) -> Picture:
         """The picture under a bar with its title."""
         bar = np.full((BAR, PANEL, 3), 30, np.uint8)
-        cv2.putText(bar, title, (8, BAR - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, WHITE, 1, cv2.LINE_AA)
+        _words(bar, title, (8, BAR - 9), 0.6, WHITE, PANEL - 16)
         return np.vstack([bar, self.picture])
 
 
@@ -99,6 +101,9 @@ def _shades(values: Floats, low: float, high: float, name: int = cv2.COLORMAP_VI
     share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
     shades: NDArray[np.uint8] = _map(name)[(255.0 * share).astype(int)]
     return shades
+
+
+SHEET = ("picture", "borders", "strokes", "score", "clusters", "lines")  # the stages on the sheet of a picture
 
 
 def stages(
@@ -117,9 +122,9 @@ def stages(
         Confidence from which a line counts.
     """
     return {
-        "picture": Canvas(gray, valid).titled("1 picture" if valid is None else "1 top view; hatched: out of sight"),
+        "picture": Canvas(gray, valid).titled("picture" if valid is None else "top view; hatched: out of sight"),
         "gradient": _gradient(gray, valid, seen),
-        "edges": _edges(gray, valid, seen),
+        "borders": _borders(gray, valid, seen),
         "strokes": _strokes(gray, valid, seen),
         "width": _widths(gray, valid, seen),
         "direction": _angles(gray, valid, seen),
@@ -127,6 +132,15 @@ def stages(
         "clusters": _clusters(gray, valid, seen),
         "lines": found(gray, valid, lines, sure),
     }
+
+
+def shown(seen: Sequence[Explanation], lines: Sequence[Line]) -> Explanation:
+    """Which of all scales and colours to show: that of the best line, found or refused, else that of most strokes."""
+    for line in sorted(lines, key=lambda line: -line.confidence):
+        for one in seen:
+            if one.polarity == line.polarity and one.width_px[0] <= line.width <= one.width_px[1]:
+                return one
+    return max(seen, key=lambda one: len(one.strokes))
 
 
 def _gradient(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
@@ -139,10 +153,10 @@ def _gradient(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Ex
     inside = canvas.picture[..., 0] == 0  # the picture is black but for the hatching outside the valid part
     canvas.picture[inside] = shown[inside]
     canvas.scale(("0", f"{top / 8.0:.0f} grey levels/px"), colours)
-    return canvas.titled(f"2 gradient at {seen.scale:.2g} x size, threshold {seen.threshold / 8.0:.1f} grey levels/px")
+    return canvas.titled(f"gradient at {seen.scale:.2g} x size, threshold {seen.threshold / 8.0:.1f} grey levels/px")
 
 
-def _edges(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
+def _borders(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
     canvas = Canvas(gray, valid, dim=0.45)
     reach = min(max(7.0 / canvas.zoom, 2.0), 5.0 / min(seen.scale, 1.0))
     way = seen.edges[:, 2:] * (1.0 if seen.polarity == "bright" else -1.0)
@@ -150,14 +164,14 @@ def _edges(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Expla
     part = seen.edges[::every, :2]
     canvas.segments(np.hstack([part, part + reach * way[::every]]), SKY)
     canvas.dots(seen.edges[:, :2], np.tile(np.array(ORANGE, np.uint8), (len(seen.edges), 1)))
-    return canvas.titled(f"3 {len(seen.edges)} thin edges (orange) and where they look for a partner (blue)")
+    return canvas.titled(f"borders: {len(seen.edges)} edges, seeking a partner (blue)")
 
 
 def _strokes(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
     canvas = Canvas(gray, valid, dim=0.45)
     canvas.segments(seen.one_sided, RED)
     canvas.segments(seen.strokes, SKY)
-    return canvas.titled(f"4 {len(seen.strokes)} strokes (blue); {len(seen.one_sided)} pairs not mutual (red)")
+    return canvas.titled(f"strokes: {len(seen.strokes)} mutual (blue), {len(seen.one_sided)} one-sided (red)")
 
 
 def _widths(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
@@ -168,7 +182,7 @@ def _widths(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Expl
     low, high = min(low, 0.9 * middle), max(high, 1.1 * middle)  # because colours for hundredths of pixels mislead
     canvas.dots(seen.centres, _shades(widths, low, high), 2)
     canvas.scale((f"{low:.1f}", f"{high:.1f} px"), _map(cv2.COLORMAP_VIRIDIS))
-    return canvas.titled("5 width of each stroke, at its centre")
+    return canvas.titled("width of each stroke, at its centre")
 
 
 def _angles(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
@@ -178,7 +192,7 @@ def _angles(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Expl
     canvas.dots(seen.centres, np.full((len(along), 3), 255, np.uint8), 3)  # because upright lines are nearly black
     canvas.dots(seen.centres, _shades(along, 0.0, 180.0, cv2.COLORMAP_TWILIGHT), 2)
     canvas.scale(("0", "180 deg"), _map(cv2.COLORMAP_TWILIGHT))
-    return canvas.titled("6 direction of the line at each stroke, from the right, anticlockwise")
+    return canvas.titled("direction at each stroke, from the right, anticlockwise")
 
 
 def _scores(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
@@ -186,7 +200,7 @@ def _scores(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Expl
     order = np.argsort(seen.score)
     canvas.dots(seen.centres[order], _shades(seen.score[order], 0.0, 1.0), 2)
     canvas.scale(("0", "1"), _map(cv2.COLORMAP_VIRIDIS))
-    return canvas.titled("7 score: neighbours of like width and direction, of those expected")
+    return canvas.titled("score: share of the expected neighbours that agree")
 
 
 def _clusters(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Explanation) -> Picture:
@@ -200,9 +214,11 @@ def _clusters(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None, seen: Ex
     order = np.argsort(seen.labels >= 0, kind="stable")  # noise first, under the rest
     canvas.dots(seen.centres[order], palette[shade[order]], 2)
     for label in np.argsort(-sizes, kind="stable")[:7]:
+        if sizes[label] < 0.1 * sizes.max():  # a few strokes of texture
+            break
         members = seen.centres[seen.labels == label]
         canvas.text(members[int(np.argmin(((members - members.mean(axis=0)) ** 2).sum(axis=1)))], f"{rank[label] + 1}")
-    return canvas.titled(f"8 {len(sizes)} clusters by place, width and direction; grey: in none")
+    return canvas.titled(f"clusters by place, width, direction: {len(sizes)}; grey: in none")
 
 
 def found(
@@ -215,9 +231,10 @@ def found(
     """The lines on the picture: borders, centre, normals every 2 widths, width and confidence; refused ones thin."""
     canvas = Canvas(gray, valid, dim=0.75)
     taken = [line for line in lines if line.confidence >= sure]
-    for line in lines:
-        if line.confidence < sure:
-            canvas.line(line.points, GREY, 1)
+    refused = sorted((line for line in lines if DOUBTFUL <= line.confidence < sure), key=lambda line: -line.confidence)
+    for k, line in enumerate(refused):
+        canvas.line(line.points, GREY, 1)
+        if k < 3:  # because more labels hide the picture
             canvas.text(line.points[len(line.points) // 2], f"refused {line.confidence:.2f}")
     for k, line in enumerate(taken):
         colour = CATEGORIES[k % len(CATEGORIES)]
@@ -233,7 +250,7 @@ def found(
         label = points[at] + 0.7 * line.width * normal[at]
         canvas.text(label, f"{line.width:.1f} px, confidence {line.confidence:.2f}")
     words = f"{len(taken)} line{'s' * (len(taken) > 1)}: centre, borders, normals" if taken else "no line"
-    return canvas.titled(title or f"9 {words}")
+    return canvas.titled(title or f"polylines: {words}")
 
 
 def rivals(
@@ -255,7 +272,7 @@ def rivals(
     otsu, _ = cv2.threshold(gray[seen].reshape(1, -1), 0.0, 255.0, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     pictures = {
         "picture": Canvas(gray, valid).titled("picture" if valid is None else "top view; hatched: out of sight"),
-        "lines": found(gray, valid, lines, sure, "robotd"),
+        "lines": found(gray, valid, [line for line in lines if line.confidence >= sure], sure, "robotd"),
     }
     for name, level in (("fixed threshold", fixed), ("Otsu threshold", float(otsu))):
         marked = ((gray <= level) if dark else (gray > level)) & seen
@@ -279,11 +296,22 @@ def rivals(
     return pictures
 
 
-def sheet(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Pictures of one size side by side, in rows."""
+def sheet(pictures: Sequence[Picture], columns: int, title: str | None = None) -> Picture:
+    """Pictures of one size side by side, in rows, in white frames, and under a title if there is one."""
     blank = np.full_like(pictures[0], 30)
     cells = [*pictures, *[blank] * (-len(pictures) % columns)]
     gap = 4
     framed = [cv2.copyMakeBorder(cell, gap, gap, gap, gap, cv2.BORDER_CONSTANT, value=WHITE) for cell in cells]
     rows = [np.hstack(framed[first : first + columns]) for first in range(0, len(framed), columns)]
+    if title is not None:
+        bar = np.full((HEAD, rows[0].shape[1], 3), 255, np.uint8)
+        _words(bar, title, (10, HEAD - 13), 0.7, BLACK, bar.shape[1] - 20)
+        rows = [bar, *rows]
     return np.asarray(np.vstack(rows), dtype=np.uint8)
+
+
+def _words(picture: Picture, words: str, at: tuple[int, int], size: float, colour: Colour, room: int) -> None:
+    """Words from `at` on, smaller where they would need more than `room` pixels."""
+    (wide, _), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    size *= min(1.0, room / max(wide, 1))
+    cv2.putText(picture, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)

@@ -184,6 +184,16 @@ class _Level:
     high: float
 
     @property
+    def middle(self) -> float:
+        """The width in the middle of those searched."""
+        return math.sqrt(self.low * self.high)
+
+    @property
+    def reach(self) -> float:
+        """How far apart two strokes of equal width and direction are neighbours."""
+        return max(0.5 * self.middle, 3.0)
+
+    @property
     def least(self) -> float:
         """The narrowest stroke that may be part of a line."""
         return self.low / min(max(math.sqrt(STROKE_SPAN * self.low / self.high), 1.0), MOST_TAPER)
@@ -247,17 +257,10 @@ class LineDetector:
 
     def _found(self, level: _Level, gray: Bytes, mask: Bytes | None) -> list[Line]:
         """What is found at one scale and is likely enough, in pixels of the given image."""
-        work = self._prepare(level, gray, mask)
-        found, _ = kernels.edges(
-            work.gx, work.gy, work.valid, THRESHOLD_FACTOR, THRESHOLD_LOW, THRESHOLD_HIGH,
-            work.level, work.index, work.sector, work.edge,
-        )  # fmt: skip
+        work, edges, _ = self._edges(level, gray, mask)
         lines: list[Line] = []
-        for sign in {"dark": (-1.0,), "bright": (1.0,), "both": (-1.0, 1.0)}[self.config.polarity]:
-            strokes = kernels.strokes(
-                work.edge, found, work.index, work.sector, level.least, level.greatest,
-                sign, PARALLEL, MUTUAL, work.partner, work.stroke,
-            )  # fmt: skip
+        for sign in SIGNS[self.config.polarity]:
+            strokes = self._strokes(work, level, edges, sign)
             pieces = _traced(work, strokes, level, sign)
             if pieces == 0:
                 continue
@@ -265,6 +268,22 @@ class LineDetector:
                 if sure >= self.config.min_confidence and level.low <= row[2] <= level.high:
                     lines.append(_refined(work, path, row, gray, self._mask, 1.0 / level.scale, sign, sure))
         return lines
+
+    def _edges(self, level: _Level, gray: Bytes, mask: Bytes | None) -> tuple[_Workspace, int, float]:
+        """The thin edges of one scale, in the buffers: these, how many, and the mean threshold."""
+        work = self._prepare(level, gray, mask)
+        found, threshold = kernels.edges(
+            work.gx, work.gy, work.valid, THRESHOLD_FACTOR, THRESHOLD_LOW, THRESHOLD_HIGH,
+            work.level, work.index, work.sector, work.edge,
+        )  # fmt: skip
+        return work, found, threshold
+
+    def _strokes(self, work: _Workspace, level: _Level, edges: int, sign: float) -> int:
+        """Fill the buffer of strokes between the edges; returns how many."""
+        return kernels.strokes(
+            work.edge, edges, work.index, work.sector, level.least, level.greatest,
+            sign, PARALLEL, MUTUAL, work.partner, work.stroke,
+        )  # fmt: skip
 
     def _likely(self, work: _Workspace, pieces: int, sign: float, strokes: int) -> list[tuple[Singles, Singles, float]]:
         """Path, row and confidence of each joined piece; the promising ones once more where they can be followed on.
@@ -337,6 +356,7 @@ class LineDetector:
         return work
 
 
+SIGNS = {"dark": (-1.0,), "bright": (1.0,), "both": (-1.0, 1.0)}
 _ERODE = np.ones((9, 9), np.uint8)
 
 
@@ -361,18 +381,22 @@ def _plausible(shape: tuple[int, ...]) -> tuple[float, float]:
     return 4.0, max(min(shape) / WIDEST, 8.0)
 
 
+def _clustered(work: _Workspace, strokes: int, level: _Level) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Cluster of each stroke centre, -1 for none, and how many strokes agree with it in place, width and direction."""
+    reach = level.reach
+    features = work.features[:strokes]
+    clustering.features(work.stroke, reach, WIDTH_WEIGHT, TURN_WEIGHT, features)
+    height, width = work.gx.shape
+    return dbscan(features, 1.0, max(3, round(0.5 * reach)), (0.0, 0.0, width / reach, height / reach))
+
+
 def _traced(work: _Workspace, strokes: int, level: _Level, sign: float) -> int:
     """Cluster the stroke centres, trace every cluster, and join what belongs together; returns how many pieces."""
     if strokes < 6:
         return 0
-    middle = math.sqrt(level.low * level.high)
-    reach = max(0.5 * middle, 3.0)
-    features = work.features[:strokes]
-    clustering.features(work.stroke, reach, WIDTH_WEIGHT, TURN_WEIGHT, features)
-    height, width = work.gx.shape
-    labels, counts = dbscan(features, 1.0, max(3, round(0.5 * reach)), (0.0, 0.0, width / reach, height / reach))
+    labels, counts = _clustered(work, strokes, level)
     clusters = clustering.sort(
-        work.stroke, labels, counts, int(labels.max()) + 1, max(4, round(0.5 * middle * LEAST_LENGTH)),
+        work.stroke, labels, counts, int(labels.max()) + 1, max(4, round(0.5 * level.middle * LEAST_LENGTH)),
         work.sorting, work.sorted, work.counts, work.first, work.axis,
     )  # fmt: skip
     if clusters == 0:
