@@ -12,6 +12,7 @@ PACKAGES = [
     "robotd.geometry",
     "robotd.operations",
     "robotd.identify",
+    "robotd.roof",
     "robotd.roomba",
     "robotd.server",
     "robotd.sim",
@@ -70,7 +71,7 @@ setup(
     package_dir={"robotd.drivers": "drivers"},
     package_data={"robotd": ["py.typed", "*.pyi", "*/*.pyi", "*/*.html"]},
     data_files=[
-        ("share/robotd/etc", ["etc/robotd.toml", "etc/60-robotd.rules"]),
+        ("share/robotd/etc", ["etc/robotd.toml", "etc/roof.toml", "etc/60-robotd.rules"]),
         ("share/robotd/etc/stores", sorted(str(path) for path in Path("etc/stores").glob("*.toml"))),
         ("share/robotd/systemd", sorted(str(path) for path in Path("systemd").iterdir())),
     ],

@@ -121,6 +121,22 @@ def plan_drivers(path: Path, sections: Mapping[str, Any]) -> dict[str, Plan]:
     return plans
 
 
+def plan_cameras(path: Path, sections: Mapping[str, Any]) -> dict[str, Plan]:
+    """Bind sections that must all be cameras; raises ConfigError listing every mistake."""
+    problems: list[str] = []
+    plans: dict[str, Plan] = {}
+    for name, section in sections.items():
+        where = f"{path} [drivers.{name}]"
+        plan = collect(problems, lambda name=name, section=section, where=where: _plan(path, name, section, where))  # type: ignore[misc]
+        if plan is not None and plan.cls.kind != "camera":
+            problems.append(f"{where} driver: '{section['driver']}' is of kind '{plan.cls.kind}'; expected a camera")
+        elif plan is not None:
+            plans[name] = plan
+    if problems:
+        raise ConfigError(*problems)
+    return plans
+
+
 def _plan(path: Path, name: str, section: Mapping[str, Any], where: str) -> Plan:
     cls = load(str(section["driver"]), where)
     config = bind(cls.Config, {key: value for key, value in section.items() if key != "driver"}, where)

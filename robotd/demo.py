@@ -21,7 +21,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AsyncExitStack, ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TextIO
@@ -31,12 +31,14 @@ from .bus import Bus
 from .clock import now, run_virtual, ticks
 from .config import save_calibration
 from .daemon import Daemon, assemble
+from .demo_roof import DemoRoof
 from .errors import InputError, RobotdError
 from .files import save_map, save_map_csv, save_survey, survey_from_json
 from .records import LinePoints, Map, Survey
 from .sim.hardware import SimHardware
 from .sim.layout import StoreLayout
 from .sim.referee import Referee
+from .sim.roof import PINS, with_roof_cameras
 from .sim.stores import find_store, load_store
 from .sim.world import World, WorldSettings, load_settings
 from .solver import solve
@@ -100,6 +102,13 @@ port = {gateway_port}
 token_file = "token"
 """
 
+BEACONS = """
+[drivers.beacons]
+driver = "gpio_beacons"
+front_pin = {front}
+rear_pin = {rear}
+"""
+
 
 def demo(arguments: argparse.Namespace) -> int:
     """Run the survey that the command line asks for; returns 0 only if a map was made."""
@@ -109,6 +118,8 @@ def demo(arguments: argparse.Namespace) -> int:
     settings = load_settings(arguments.world) if arguments.world is not None else WorldSettings()
     out: Path = arguments.out
     run = _fresh_folder(out / ".robotd")
+    if arguments.roof:
+        layout = with_roof_cameras(layout)
     world = World(layout, settings, arguments.seed, run / "labels")
     with ExitStack() as stack:
         token_file = run / "robot" / "token"
@@ -124,9 +135,10 @@ def demo(arguments: argparse.Namespace) -> int:
 
             recorder = stack.enter_context(FrameRecorder(out / "recording.mcap"))
         daemon = Daemon(assemble(path, SimHardware(world, tap=recorder)))
+        roof = DemoRoof(world, run / "roof", run / "server") if layout.roof_cameras else None
         trail: Trail = []
         line: list[LinePoints] = []
-        mission_s = _run(daemon, world, trail, line, realtime=arguments.realtime, progress=sys.stderr)
+        mission_s = _run(daemon, world, trail, line, roof, realtime=arguments.realtime, progress=sys.stderr)
         survey = _download_survey(server, layout.name, token)
     return _report(
         arguments, layout, world, daemon, survey, trail=trail, line=line, mission_s=mission_s, started=started
@@ -145,7 +157,14 @@ def _fresh_folder(run: Path) -> Path:
 
 
 def _run(
-    daemon: Daemon, world: World, trail: Trail, line: list[LinePoints], *, realtime: bool, progress: TextIO
+    daemon: Daemon,
+    world: World,
+    trail: Trail,
+    line: list[LinePoints],
+    roof: DemoRoof | None,
+    *,
+    realtime: bool,
+    progress: TextIO,
 ) -> float:
     """Run the daemon on the world until its mission has ended; returns seconds of mission on the loop's clock."""
 
@@ -158,8 +177,12 @@ def _run(
                 group.create_task(_keep_line(daemon.assembly.bus, line)),
             ]
             begun = asyncio.get_running_loop().time()
-            await daemon.run(mission=True)
-            elapsed = asyncio.get_running_loop().time() - begun
+            bus = daemon.assembly.bus
+            async with AsyncExitStack() as stack:
+                if roof is not None:
+                    await stack.enter_async_context(roof.running(daemon.assembly.hardware, bus, bus))
+                await daemon.run(mission=True)
+                elapsed = asyncio.get_running_loop().time() - begun
             await asyncio.sleep(0.0)  # so that what closing published is taken too
             for task in background:
                 task.cancel()
@@ -238,6 +261,8 @@ def _write_config(folder: Path, world: World, *, url: str, gateway_port: int) ->
         color=json.dumps(layout.line.color),
         gateway_port=gateway_port,
     )
+    if layout.roof_cameras:
+        text += BEACONS.format(**PINS)
     path = folder / "robotd.toml"
     path.write_text(text)
     return path

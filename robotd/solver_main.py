@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from . import workbench_tool
 from .errors import InputError, RobotdError
+from .roof_commands import add_calibrate_roof, add_roof
 
 if TYPE_CHECKING:
     from .records import Map, Survey
@@ -101,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     serve.set_defaults(run=_serve)
     _add_calibrate(commands)
     workbench_tool.add(commands)
+    add_roof(commands)
     return parser
 
 
@@ -145,6 +147,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     floor.add_argument("--picture", type=Path, metavar="PNG", help="also draw the corners' residuals and the top view")
     floor.add_argument("--json", action="store_true", help="print one JSON object")
     floor.set_defaults(run=_calibrate_floor)
+    add_calibrate_roof(kinds)
 
 
 def _board(text: str) -> tuple[int, int]:

@@ -39,10 +39,22 @@ LAYERS = {
         "journal_records",
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "prompt", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
+        "roof",
+        *("camera_feed", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
     ],
     3: ["plugin", "camera_driver", "workbench"],
     4: ["drivers"],
-    5: ["mission", "control", "wheel_runs", "recorder", "supervisor", "control_socket", "daemon", "operations"],
+    5: [
+        "mission",
+        "control",
+        "roof_watch",
+        "wheel_runs",
+        "recorder",
+        "supervisor",
+        "control_socket",
+        "daemon",
+        "operations",
+    ],
     6: ["sim", "server"],
     7: [
         "__main__",
@@ -52,6 +64,9 @@ LAYERS = {
         "record_tool",
         "workbench_tool",
         "workbench_commands",
+        "demo_roof",
+        "roof_tool",
+        "roof_commands",
         "calibrate",
         "doctor",
         "solver_main",
@@ -133,7 +148,7 @@ def test_drivers_never_import_one_another():
 
 def test_only_the_programs_know_the_simulator():
     for module, path in MODULES.items():
-        if top(module) not in ("sim", "demo", "__main__"):
+        if top(module) not in ("sim", "demo", "demo_roof", "__main__"):
             known = {name for name in imports(module, path) if name.startswith("robotd.sim")}
             assert not known, f"{module} imports {known}"
 

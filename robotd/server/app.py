@@ -8,6 +8,7 @@
     GET /api/recordings                               names, sizes and hashes of the complete ones
     GET /api/recordings/{name}                        {"received": bytes, "complete": bool}
     PUT /api/recordings/{name}                        a piece, see below
+    GET /api/roof                                     how the roof cameras do, and where the robot is
     GET /healthz                                      no token needed
 
 Every refusal is JSON, {"problems": ["...", ...]}. A PUT may carry the SHA-256 of its body (RFC 9530); it is answered
@@ -116,6 +117,11 @@ def create_app(
 
     if recordings is not None:
         _add_recordings(api, recordings)
+
+    @api.get("/roof")
+    async def roof() -> Response:
+        body = await asyncio.to_thread(store.roof_status)
+        return Response(body, media_type="application/json")
 
     @app.get("/healthz")
     async def healthz() -> JSONResponse:

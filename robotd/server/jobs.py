@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..errors import RobotdError
+from .roof import with_notes
 from .store import Store
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ class MapJobs:
             if self._executor is executor:
                 self._executor = None
             raise JobError(f"survey {name!r}: the solver process died (out of memory?); ask again") from error
+        solved = with_notes(solved, await asyncio.to_thread(self._store.notes, name))
         await asyncio.to_thread(self._store.put_map, name, revision, solved)
         return solved
 

@@ -22,6 +22,7 @@ import msgspec
 from .. import __version__
 from ..errors import InputError, RobotdError
 from ..files import header_from_json, stop_from_json, write_atomic
+from .roof import join_roof
 
 _STOP = re.compile(r"stop-(\d+)-(\d+)\.json")
 _LONGEST_NAME = 200  # bytes of a folder's name, below every file system's limit
@@ -43,6 +44,7 @@ class Store:
     """Surveys in a folder, which is made when the first record comes; every method may be called from any thread."""
 
     def __init__(self, data: Path) -> None:
+        self._data = data
         self._folder = data / "surveys"
         self._lock = threading.RLock()
 
@@ -113,19 +115,40 @@ class Store:
     def survey(self, name: str) -> tuple[bytes, str]:
         """A whole survey as `robotd-survey/1`, and its revision, which changes with every record.
 
+        What roof cameras saw of its stops is in it (robotd.server.roof).
+
         Raises
         ------
         UnknownSurveyError, StoreError
+        InputError
+            If a file of the roof cameras is wrong.
         """
+        body, _, revision = self._whole(name)
+        return body, revision
+
+    def notes(self, name: str) -> tuple[str, ...]:
+        """What the roof cameras' part of a survey gives reason to tell the operator; raises as `survey`."""
+        return self._whole(name)[1]
+
+    def roof_status(self) -> bytes:
+        """What `robotd-solver roof watch` said last, JSON; {} if it never ran here."""
+        return _read(self._data / "roof" / "status.json") or b"{}"
+
+    def _whole(self, name: str) -> tuple[bytes, tuple[str, ...], str]:
         with self._lock:
             header = self._header(name)
             stops = [_read(path) or b"" for _, path in sorted(_stops(self._of(name)).items())]
         table = msgspec.json.decode(header)
         table["stops"] = [msgspec.Raw(stop) for stop in stops]
         revision = hashlib.sha256(__version__.encode())  # another solver makes another map
-        for body in (header, *stops):
+        for part in (header, *stops):
+            revision.update(hashlib.sha256(part).digest())
+        plain = msgspec.json.encode(table)
+        body, notes = join_roof(plain, f"survey {name!r}", self._data)
+        if body is not plain or notes:
             revision.update(hashlib.sha256(body).digest())
-        return msgspec.json.encode(table), revision.hexdigest()[:32]
+            revision.update("\n".join(notes).encode())
+        return body, notes, revision.hexdigest()[:32]
 
     def map(self, name: str, revision: str) -> bytes | None:
         """The map of this revision, if there is one."""

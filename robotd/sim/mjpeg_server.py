@@ -31,7 +31,8 @@ _ESTABLISHED = 1  # tcp_states.h
 _SIOCOUTQNSD = 0x894B  # <linux/sockios.h>: bytes not sent yet
 REALM, NONCE = "camera", "5ca1ab1e0ddba11"
 
-Render = Callable[[float], NDArray[np.uint8]]
+Image = NDArray[np.uint8]
+Render = Callable[[float], Image | Callable[[], Image]]
 Wire = Callable[[int, bytes], Sequence[bytes | float | None]]
 
 
@@ -41,7 +42,8 @@ class NetworkCameraSettings:
 
     `delay_min` and `delay_max` bound the time from the exposure to sending, in seconds. Its own clock shows
     `clock_offset` at loop time 0 and gains `clock_skew` seconds a second; it is sent in the header `stamps` if that is
-    named. `delimiter` is what stands on the wire, `boundary` what the Content-Type names.
+    named. `delimiter` is what stands on the wire, `boundary` what the Content-Type names. A frame is drawn `exposed`
+    seconds after its exposure began, when that is over; the share `drop` of the frames is never sent.
     """
 
     path: str = "/video"
@@ -57,6 +59,8 @@ class NetworkCameraSettings:
     clock_skew: float = 0.0
     delay_min: float = 0.040
     delay_max: float = 0.060
+    exposed: float = 0.0
+    drop: float = 0.0
     login: Literal["none", "basic", "digest"] = "none"
     user: str = "viewer"
     password: str = "secret"
@@ -71,7 +75,8 @@ class MjpegServer:
     Parameters
     ----------
     render : callable
-        From loop time in seconds to the (H, W) grey or (H, W, 3) BGR image exposed then.
+        From loop time in seconds to the (H, W) grey or (H, W, 3) BGR image whose exposure began then, or to a function
+        that draws it in a thread.
     settings : NetworkCameraSettings
         May be replaced while it runs: the next connection obeys it.
     seed : int
@@ -155,21 +160,24 @@ class MjpegServer:
         while True:
             t = start + number / settings.fps
             delay = self._rng.uniform(settings.delay_min, settings.delay_max)
-            await asyncio.sleep(max(0.0, t - now()))
+            number += 1
+            is_lost = settings.drop > 0.0 and self._rng.random() < settings.drop
+            await asyncio.sleep(max(0.0, t + settings.exposed - now()))
+            if is_lost:
+                continue
             part = _part(settings, t, await in_thread(_encode, self._render(t), settings.quality))
             await asyncio.sleep(max(0.0, t + delay - now()))
-            for piece in self._wire(number, part):
+            for piece in self._wire(number - 1, part):
                 if piece is None:
                     return
                 if isinstance(piece, bytes):
                     await _send(writer, b"%x\r\n%s\r\n" % (len(piece), piece) if settings.chunked else piece)
                 else:
                     await asyncio.sleep(piece)
-            number += 1
 
 
-def _encode(image: NDArray[np.uint8], quality: int) -> bytes:
-    done, data = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))
+def _encode(image: Image | Callable[[], Image], quality: int) -> bytes:
+    done, data = cv2.imencode(".jpg", image() if callable(image) else image, (cv2.IMWRITE_JPEG_QUALITY, quality))
     assert done
     return data.tobytes()
 

@@ -10,6 +10,7 @@ from ..bind import bind, ranged
 from ..config import read_toml
 from .camera import SensorSettings
 from .labels import LabelSystemSettings
+from .roof import RoofCameraSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,7 @@ class WorldSettings:
     sensor: SensorSettings = field(default_factory=SensorSettings)
     floor: FloorSettings = field(default_factory=FloorSettings)
     labels: LabelSystemSettings = field(default_factory=LabelSystemSettings)
+    roof: RoofCameraSettings = field(default_factory=RoofCameraSettings)
 
     def __post_init__(self) -> None:
         if self.delay_min > self.delay_max:

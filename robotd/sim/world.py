@@ -19,6 +19,7 @@ from .body import Body
 from .labels import LabelSystem
 from .layout import StoreLayout
 from .pins import PinStates
+from .roof import BEACONS, RoofEye, calibration_points, roof_model
 from .roomba import RoombaQuirks, SimRoomba
 from .scene import Scene
 from .settings import WorldSettings, load_settings
@@ -141,6 +142,7 @@ class World:
             ),
             cameras=tuple(self._believed(camera) for camera in self.rig),
             floor_camera=self._believed(self.floor_camera),
+            beacons=self._believed_beacons(),
             gamma=s.sensor.gamma,
             row_time_s=s.sensor.readout / self.rig[0].size[1],
             priors=Priors(
@@ -153,6 +155,32 @@ class World:
                 odometry_turn=math.hypot(s.wheel_scale_error, s.wheel_base_error),
             ),
         )
+
+    def roof_eye(self, name: str) -> RoofEye:
+        """What one of the layout's roof cameras sees."""
+        layout = next(camera for camera in self.layout.roof_cameras if camera.name == name)
+        return RoofEye(
+            self.scene,
+            roof_model(layout),
+            self.settings.roof,
+            self.settings.sensor,
+            robot=self.body.T_store_robot,
+            light=self.pins.level,
+            lit=self.lit,
+            seed=int(self.rng(f"renderer/{name}").integers(2**31)),
+            radius=self.settings.robot_radius,
+        )
+
+    def roof_points(self, name: str, eye: RoofEye) -> list[tuple[float, float, float, float, float]]:
+        """(u, v, x, y, z) of floor points as the operator measured them for one roof camera, in world axes."""
+        return calibration_points(eye, self.layout, self.to_world, self.rng(f"points/{name}"))
+
+    def _believed_beacons(self) -> dict[str, Vector3]:
+        """The beacons' measured places on the robot; none in a store without roof cameras."""
+        if not self.layout.roof_cameras:
+            return {}
+        rng, sigma = self.rng("beacons"), self.settings.roof.beacon_error
+        return {name: _vector3(np.array(place) + sigma * rng.standard_normal(3)) for name, place in BEACONS.items()}
 
     def to_world(self, points: Floats) -> Floats:
         """(N, 3) points from store to world axes: the robot's true x, y, heading at its start, z from the floor."""
