@@ -40,7 +40,6 @@ LAYERS = {
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "prompt", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
         "roof",
-        *("camera_feed", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
     ],
     3: ["plugin", "camera_driver", "workbench"],
     4: ["drivers"],
