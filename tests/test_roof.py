@@ -406,7 +406,7 @@ def test_the_example_has_every_key_with_its_default():
 
     path = Path(__file__).parent.parent / "etc" / "roof.toml"
     load_setup(path)
-    text = path.read_text().split("[drivers.", 1)[0]
+    text = path.read_text().split("\n[drivers.", 1)[0]
     shown = tomllib.loads(re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE))
     for section, cls in (("roof", RoofSettings), ("detector", BeaconConfig)):
         assert shown[section].keys() == {field.name for field in fields(cls)}

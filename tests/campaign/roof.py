@@ -24,7 +24,7 @@ def varied(seed, **changes):
         "light": float(rng.uniform(0.25, 1.5)),
         "blur": float(rng.uniform(0.8, 1.6)),
         "quality": int(rng.choice([60, 75, 90])),
-        "direction": float(rng.uniform(0.0, 1.2)),
+        "direction": float(rng.uniform(0.0, 0.6)),
         "start": (float(rng.uniform(55.0, 75.0)), float(rng.uniform(55.0, 70.0))),
         "walker": bool(rng.random() < 0.5),
         "stamp_error": float(rng.uniform(0.0, 0.006)),
