@@ -22,9 +22,13 @@ import robotd.gateway as gateway
 from robotd.bind import bind
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
-from robotd.errors import ConfigError, DriverFault
+from robotd.config import Calibration, MissionConfig
+from robotd.errors import ConfigError, DriverFault, MissionError
 from robotd.gateway import Gateway, Outbox, main
+from robotd.identify import FlashRequest
+from robotd.mission import Health, Mission
 from robotd.plugin import Labels
+from robotd.records import Pose
 
 TOKEN = "secret"
 FLASH = {"id": 1, "token": TOKEN, "method": "flash", "labels": ["A17", "B 2"], "duration": 3, "strength": 1.0}
@@ -593,6 +597,47 @@ def test_the_driver_gives_up_on_a_gateway_that_hangs(tmp_path):
             await driver.close()
 
     asyncio.run(run())
+
+
+class Anything:
+    """In place of what a mission does not need here."""
+
+    name = "labels"
+
+    def __getattr__(self, name):
+        return lambda *arguments, **options: None
+
+
+def test_a_refused_label_is_reported_once_and_left_out_and_all_of_them_stop_the_mission():
+    class Choosy(Anything):
+        async def flash(self, labels, strength, durations):
+            return {label: "unknown" for label in labels if label != "A2"}
+
+    async def run():
+        names = ("hardware", "base", "follower", "eye", "odometry", "journal")
+        bus = Bus()
+        mission = Mission(
+            *(MissionConfig(labels=("A1", "A2")), Calibration()),
+            **{name: Anything() for name in names},
+            labels=Choosy(),
+            bus=bus,
+            cameras={},
+            health=Health(lambda: None, lambda: None),
+            wake_upload=lambda: None,
+        )
+        with bus.events.subscribe() as events:
+            for _ in range(2):
+                await mission._ask(FlashRequest(("A1", "A2"), (3, 4)))
+            assert events.waiting == 1
+            assert (await events.get()).text == "labels: A1 is refused and left out: unknown"
+        assert mission.refused == {"A1": "unknown"}
+        assert mission.memory.candidates(Pose(0.0, 0.0, 0.0), 0.0, []).wanted.tolist() == [False, True]
+        mission.labels.flash = lambda *arguments: asyncio.sleep(0, {"A2": "unknown"})
+        with pytest.raises(MissionError, match="labels: every label is refused, the last one: unknown"):
+            await mission._ask(FlashRequest(("A2",), (3,)))
+        assert mission.memory.candidates(Pose(0.0, 0.0, 0.0), 0.0, []).wanted.all()  # when it goes on
+
+    run_virtual(run())
 
 
 def test_the_drivers_section_is_checked():

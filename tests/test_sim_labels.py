@@ -171,6 +171,22 @@ def test_delays_losses_and_clock_errors_have_the_promised_statistics(tmp_path):
     assert np.std(system._rate - 1.0) == pytest.approx(0.001, rel=0.06)
 
 
+def test_weak_batteries_make_dim_lights_that_often_do_not_answer(tmp_path):
+    ids = [str(number) for number in range(2000)]
+    settings = LabelSystemSettings(commands_per_s=1e6, weak_fraction=0.25, weak_light=0.4, weak_lost_fraction=0.3)
+    system = make_system(tmp_path, settings, ids=ids, seed=4)
+    command(tmp_path, "a.txt", *(f"FLASH;{label};1;1.0" for label in ids))
+    system.scan(0.0)
+    assert system.weak.sum() == 500
+    lit = np.array([bool(flashes) for flashes in system._flashes])
+    assert 0.62 < lit[system.weak].mean() < 0.76
+    assert lit[~system.weak].mean() > 0.96
+    strengths = {
+        flashes[0].strength for flashes, weak in zip(system._flashes, system.weak, strict=True) if flashes and weak
+    }
+    assert strengths == {0.4}
+
+
 def test_the_same_seed_gives_the_same_light(tmp_path):
     def run(seed):
         system = make_system(tmp_path, LabelSystemSettings(), seed=seed)

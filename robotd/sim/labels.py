@@ -40,6 +40,9 @@ class LabelSystemSettings:
     delay_median_s: float = ranged(1.0, minimum=1e-3, maximum=60.0, doc="from sending to the first flash, median")
     delay_p95_s: float = ranged(3.0, minimum=1e-3, maximum=600.0, doc="the same, 95th percentile")
     lost_fraction: float = ranged(0.02, minimum=0.0, maximum=1.0, doc="commands that never arrive")
+    weak_fraction: float = ranged(0.0, minimum=0.0, maximum=1.0, doc="labels whose batteries are nearly empty")
+    weak_light: float = ranged(0.4, minimum=0.01, maximum=1.0, doc="how brightly these flash, relative to the others")
+    weak_lost_fraction: float = ranged(0.2, minimum=0.0, maximum=1.0, doc="commands that these do not hear")
     clock_error: float = ranged(0.001, minimum=0.0, maximum=0.1, doc="relative rate error of a label's clock, sigma")
 
     def __post_init__(self) -> None:
@@ -84,6 +87,10 @@ class LabelSystem:
         self._rng = rng
         self._rate = 1.0 + settings.clock_error * rng.standard_normal(len(label_ids))
         self._first_scan = settings.poll_s * rng.random()
+        self.weak = np.zeros(len(label_ids), bool)
+        if settings.weak_fraction:
+            weak = rng.permutation(len(label_ids))[: round(settings.weak_fraction * len(label_ids))]
+            self.weak[weak] = True
         self._spread = math.log(settings.delay_p95_s / settings.delay_median_s) / NORMAL_95
         self._free = -math.inf  # when the next command can be sent
         self._flashes: list[list[_Flash]] = [[] for _ in label_ids]
@@ -161,6 +168,9 @@ class LabelSystem:
         is_lost = self._rng.random() < self.settings.lost_fraction
         delay = self.settings.delay_median_s * math.exp(self._spread * self._rng.standard_normal())
         index = self._index.get(label)
+        if index is not None and self.weak[index]:
+            is_lost |= self._rng.random() < self.settings.weak_lost_fraction
+            strength *= self.settings.weak_light
         if is_lost or index is None:  # a label of another store takes its turn all the same
             self.lost += 1
             return
