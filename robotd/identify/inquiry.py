@@ -179,7 +179,7 @@ class Inquiry:
         cover = 1.0 - min(max(2.0 / max(len(undecided), 1), 0.01), 0.08)
         for light in undecided:
             labels, odds = posterior.candidates[light]
-            kept = candidates.wanted[labels]
+            kept = candidates.wanted[labels] & self.asked[labels]  # others cannot have lit it
             labels, odds = labels[kept], odds[kept]
             enough = int(np.searchsorted(np.cumsum(odds), cover * odds.sum())) + 1
             value[labels[:enough]] = np.maximum(value[labels[:enough]], odds[:enough])
