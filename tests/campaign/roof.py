@@ -50,7 +50,8 @@ def test_standing(channel):
 def test_moving():
     found, kept = [], 0
     for seed in SEEDS:
-        film = varied(seed, travelled=ramp(SPEED_PX, 60.0, 3.5, 6.9))
+        # without a walker, because the film's walks over the robot all along its way, which would hide it in a shop
+        film = varied(seed, walker=False, travelled=ramp(SPEED_PX, 60.0, 3.5, 6.9))
         rows = [row for row in errors(film, BeaconDetector(BeaconConfig()), 7.2) if 4.2 < row[0].t < 6.2]
         found += rows
         kept += len({fix.beacon for fix, _, _ in rows})
