@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import json
 import logging
 import math
 import os
@@ -50,11 +51,26 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--realtime", action="store_true", help="run at wall speed instead of as fast as possible")
     demo.add_argument("--roof", action="store_true", help="with two roof cameras, in a store that has none of its own")
     demo.add_argument("--record", action="store_true", help="keep every frame and every serial byte (MCAP; large)")
+    _add_doctor(commands)
     _add_sim(commands)
     _add_calibrate(commands)
     _add_line(commands)
     _add_record(commands)
     return top
+
+
+def _add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    doctor = commands.add_parser(
+        "doctor", help="check all that a new owner gets wrong; each finding says how to mend it"
+    )
+    doctor.add_argument("-c", "--config", type=Path, default=DEFAULT_CONFIG, help=f"default: {DEFAULT_CONFIG}")
+    doctor.add_argument("--socket", type=Path, metavar="PATH", help="of the running robotd (default: as configured)")
+    doctor.add_argument("--quick", action="store_true", help="leave out running everything together for a minute")
+    doctor.add_argument("--json", action="store_true", help="print the findings as one JSON object")
+    config = commands.add_parser("config", help="the configuration's JSON schema").add_subparsers(
+        dest="what", required=True, metavar="WHAT"
+    )
+    config.add_parser("schema", help="of robotd.toml, with the drivers that are installed")
 
 
 def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -202,6 +218,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             from .sim.terminal import run as be_roomba
 
             return be_roomba(arguments)
+        if arguments.command == "doctor":
+            from .doctor import run as examine
+
+            return examine(arguments)
+        if arguments.command == "config":
+            return show_schema()
         if arguments.command == "calibrate":
             from .calibrate import run_command
 
@@ -233,6 +255,14 @@ def _one_thread_each() -> None:
     import cv2
 
     cv2.setNumThreads(1)
+
+
+def show_schema() -> int:
+    """Print the configuration's JSON schema."""
+    from .config_views import schema
+
+    print(json.dumps(schema(), indent=2))
+    return 0
 
 
 def check(path: Path) -> int:

@@ -23,13 +23,13 @@ from .clock import outside
 from .config import Calibration, load_calibration, load_config, save_wheels
 from .control import ControlLoop
 from .daemon import read_config
-from .errors import ConfigError, InputError, MissionError, RobotdError
+from .errors import InputError, MissionError, RobotdError
 from .hardware import Hardware
 from .odometry import Odometry, Wheels
 from .plugin import Base, Driver
 from .safety import SafetyGate, SafetyLimits
-from .wheel_calibration import KINDS, Run, WheelCalibration, calibrate
-from .wheel_runs import Person, RunPlan, collect
+from .wheel_calibration import KINDS, Run, calibrate, summary
+from .wheel_runs import Person, RunPlan, check_writable, collect
 
 INTRODUCTION = """\
 You need: a flat piece of the floor on which the robot will work, {room:.1f} m long; a strip of tape on it, straight;
@@ -102,7 +102,7 @@ async def calibrate_odometry(path: Path, plan: RunPlan, hardware: Hardware, pers
     config, plans = read_config(path)
     target = path.parent / config.robot.calibration
     calibration = load_calibration(target) if target.exists() else Calibration()
-    _check_writable(target)
+    check_writable(target)
     await person.tell(INTRODUCTION.format(room=plan.distance + 0.5, runs=len(KINDS) * plan.repeat))
     bus = Bus()
     base = next(plan for plan in plans.values() if plan.cls.kind == "base")
@@ -136,42 +136,6 @@ async def _drive(
     finally:
         await driver.close()
     return runs
-
-
-def _check_writable(path: Path) -> None:
-    """Fail before the robot moves rather than after it."""
-    folder = path.resolve().parent
-    if not folder.is_dir():
-        raise ConfigError(f"{path}: there is no folder {folder}; create it, or change [robot] calibration")
-    if not os.access(folder, os.W_OK):
-        raise ConfigError(f"{path}: cannot be written by this user; run the command as the user of robotd")
-
-
-def summary(result: WheelCalibration, before: Wheels, runs: list[Run]) -> str:
-    """What came out, old and new, with standard deviations, for a person."""
-    new = result.wheels
-    S = new.covariance
-    left, right, base = (math.sqrt(S[i][i]) for i in range(3))
-    difference = math.sqrt(max(0.0, S[0][0] + S[1][1] - 2.0 * S[0][1]))
-    lines = ["", "                          before         now"]
-    for name, old, value, sigma in (
-        ("left wheel", before.scale_left, new.scale_left, left),
-        ("right wheel", before.scale_right, new.scale_right, right),
-    ):
-        lines.append(f"{name:<18}{1e3 * (old - 1.0):+12.1f}{1e3 * (value - 1.0):+12.1f} +- {1e3 * sigma:.1f} mm/m")
-    lines += [
-        f"{'wheel base':<18}{1e3 * before.base:12.1f}{1e3 * new.base:12.1f} +- {1e3 * base:.1f} mm"
-        f" (+- {360.0 * base / new.base:.1f} degrees a turn)",
-        f"known so well, a straight of 100 m ends within {math.degrees(100.0 * difference / new.base):.1f} degrees "
-        "of the true heading (one sigma)",
-        "",
-        "measured minus computed, and its standard deviation with the wheels' own noise:",
-    ]
-    for number, (run, residual, sigma_of) in enumerate(zip(runs, result.residuals, result.sigmas, strict=True), 1):
-        factor, unit = (180.0 / math.pi, "degrees") if run.turn is not None else (1e3, "mm along, sideways")
-        parts = [f"{factor * r:+.1f} +- {factor * s:.1f}" for r, s in zip(residual, sigma_of, strict=True)]
-        lines.append(f"  run {number:<3}{run.kind:<29}{', '.join(parts)} {unit}")
-    return "\n".join(lines)
 
 
 class Terminal:

@@ -99,6 +99,7 @@ class UploadConfig:
 
     url: str | None = None
     token_file: Path | None = None
+    token_credential: str | None = None
     retry_s: float = ranged(5.0, minimum=0.1, maximum=3600.0)
     timeout_s: float = ranged(30.0, minimum=0.1, maximum=600.0)
 
@@ -178,6 +179,8 @@ def load_config(path: Path) -> Config:
                 f"{path} [drivers.{section}]: missing key 'driver'; expected the name of an installed driver"
             )
     config = collect(problems, lambda: bind(Config, data, str(path)))
+    if config is not None and None not in (config.upload.token_file, config.upload.token_credential):
+        problems.append(f"{path} upload: found token_file and token_credential; expected one of them")
     if problems or config is None:
         raise ConfigError(*problems)
     return config

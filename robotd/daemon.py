@@ -33,6 +33,7 @@ from .recorder import Recordings
 from .recording_upload import RecordingUploader
 from .records import Event, Map
 from .safety import SafetyGate
+from .secret_file import read_credential, read_secret
 from .serial_log import LoggedHardware, SerialLog
 from .supervisor import Supervisor
 from .upload import Uploader
@@ -389,13 +390,11 @@ class Daemon:
             return None
         token = None
         if upload.token_file is not None:
-            path = self.assembly.path.parent / upload.token_file
-            try:
-                token = path.read_text().strip()
-            except OSError as error:
-                raise ConfigError(
-                    f"{self.assembly.path} upload.token_file: {path} cannot be read: {error.strerror}"
-                ) from error
+            token = read_secret(
+                self.assembly.path.parent / upload.token_file, f"{self.assembly.path} upload.token_file"
+            )
+        elif upload.token_credential is not None:
+            token = read_credential(upload.token_credential, f"{self.assembly.path} upload.token_credential")
 
         def report(text: str, level: Any = "info") -> None:
             self.assembly.bus.events.publish(Event(now(), "upload", level, text))

@@ -294,3 +294,30 @@ def _noise(run: Run, wheels: Wheels) -> Floats:
     H = np.array([[1.0, 0.0, -run.reach[1] * math.sin(heading)], [0.0, 1.0, run.reach[1] * math.cos(heading)]])
     covariance: Floats = H @ moment @ H.T + np.diag(np.square(run.offset_sigma))
     return covariance
+
+
+def summary(result: WheelCalibration, before: Wheels, runs: list[Run]) -> str:
+    """What came out, old and new, with standard deviations, for a person."""
+    new = result.wheels
+    S = new.covariance
+    left, right, base = (math.sqrt(S[i][i]) for i in range(3))
+    difference = math.sqrt(max(0.0, S[0][0] + S[1][1] - 2.0 * S[0][1]))
+    lines = ["", "                          before         now"]
+    for name, old, value, sigma in (
+        ("left wheel", before.scale_left, new.scale_left, left),
+        ("right wheel", before.scale_right, new.scale_right, right),
+    ):
+        lines.append(f"{name:<18}{1e3 * (old - 1.0):+12.1f}{1e3 * (value - 1.0):+12.1f} +- {1e3 * sigma:.1f} mm/m")
+    lines += [
+        f"{'wheel base':<18}{1e3 * before.base:12.1f}{1e3 * new.base:12.1f} +- {1e3 * base:.1f} mm"
+        f" (+- {360.0 * base / new.base:.1f} degrees a turn)",
+        f"known so well, a straight of 100 m ends within {math.degrees(100.0 * difference / new.base):.1f} degrees "
+        "of the true heading (one sigma)",
+        "",
+        "measured minus computed, and its standard deviation with the wheels' own noise:",
+    ]
+    for number, (run, residual, sigma_of) in enumerate(zip(runs, result.residuals, result.sigmas, strict=True), 1):
+        factor, unit = (180.0 / math.pi, "degrees") if run.turn is not None else (1e3, "mm along, sideways")
+        parts = [f"{factor * r:+.1f} +- {factor * s:.1f}" for r, s in zip(residual, sigma_of, strict=True)]
+        lines.append(f"  run {number:<3}{run.kind:<29}{', '.join(parts)} {unit}")
+    return "\n".join(lines)

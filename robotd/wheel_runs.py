@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +19,7 @@ from .bind import ranged
 from .bus import Subscription
 from .clock import now
 from .control import ControlLoop
-from .errors import DriverFault, MissionError
+from .errors import ConfigError, DriverFault, MissionError
 from .odometry import Wheels
 from .records import DriveCommand, Floats, SensorFrame, Withdrawal
 from .wheel_calibration import KINDS, Run, disagreeing, implausible, thinned
@@ -99,6 +101,15 @@ async def collect(control: ControlLoop, wheels: Wheels, plan: RunPlan, person: P
         control.bus.withdrawals.publish(Withdrawal(now(), SOURCE, "the calibration ended"))
         control.base.halt()
     return runs
+
+
+def check_writable(path: Path) -> None:
+    """Fail before the robot moves rather than after it."""
+    folder = path.resolve().parent
+    if not folder.is_dir():
+        raise ConfigError(f"{path}: there is no folder {folder}; create it, or change [robot] calibration")
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"{path}: cannot be written by this user; run the command as the user of robotd")
 
 
 async def _run(control: ControlLoop, wheels: Wheels, plan: RunPlan, person: Person, kind: str, name: str) -> Run:

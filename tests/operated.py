@@ -12,16 +12,27 @@ from robotd.config import Calibration, Config, MissionConfig, RecordingConfig, R
 from robotd.control_socket import ControlSocket
 from robotd.daemon import Assembly, Daemon
 from robotd.hardware import CameraCounts, CameraMode
+from robotd.identify import IdentifyConfig
 from robotd.operations import Operations
 from robotd.plugin import Driver
 from robotd.records import DriveCommand, Frame
 from tests.hazard_course import Course
 
+QUICK = IdentifyConfig(
+    poll_s=0.2,
+    delay_median_s=0.1,
+    delay_normal_s=0.3,
+    delay_tail_s=0.5,
+    durations_s=(1, 2),
+    check_digits=0,
+    stop_s=10.0,
+)
+
 
 class Walker(Driver):
     """A follower without a line: straight on."""
 
-    kind, blind, mode = "follower", 0.0, CameraMode((64, 48), 10.0)
+    kind, blind, mode = "follower", 0.0, CameraMode((64, 48), 30.0)
 
     async def follow(self, travelled, *, at_marker=False):
         with self.bus.odometry.subscribe() as odometry:
@@ -105,7 +116,7 @@ class Operated:
         )
         config = Config(
             RobotConfig("trial", folder / "state", folder / "calibration.toml"),
-            MissionConfig("store", stops, ("a",)),
+            MissionConfig("store", stops, ("a",), identify=QUICK),
             recording=RecordingConfig(folder / "recordings", keep_free_mb=0.0),
             drivers={name: {"driver": name} for name in ("base", *make)},
         )

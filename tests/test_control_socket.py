@@ -1,12 +1,14 @@
 """Operators at the control socket: what is understood, what is refused, and that a lost one halts the robot."""
 
 import asyncio
+import dataclasses
 import json
 import os
 import socket
 import stat
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,6 +17,7 @@ from robotd import rpc
 from robotd.clock import now, run_virtual
 from robotd.control_socket import CLIENTS, ControlSocket
 from robotd.errors import InputError
+from robotd.operations import METHODS
 from robotd.rpc import RpcError
 from tests.hazard_course import BRAKING
 from tests.operated import operated
@@ -153,6 +156,30 @@ def test_a_client_that_takes_nothing_costs_a_bounded_memory_and_is_cut_off(tmp_p
             assert await other.call("mission.status")
         waiting = len(await client.reader.read()) if client.writer.transport.resume_reading() is None else 0
         assert waiting < 1 << 20
+
+    operated(tmp_path, scenario)
+
+
+def test_nonsense_from_a_client_neither_ends_the_daemon_nor_moves_the_robot_for_long(tmp_path):
+    rng = np.random.default_rng(5)
+    values = (None, True, -1, 0, 1e300, "x" * 300, [], {}, [[1]], "eye", "odometry", 0.1, 3, "base", "warning", "time")
+    keys = sorted({item.name for params, _ in METHODS.values() for item in dataclasses.fields(params)})
+
+    async def scenario(robot, client):
+        for _ in range(30):
+            async with robot.connected() as other:
+                for _ in range(20):
+                    chosen = [keys[k] for k in rng.integers(len(keys), size=rng.integers(4))]
+                    params = {key: values[rng.integers(len(values))] for key in chosen}
+                    other.send(list(METHODS)[rng.integers(len(METHODS))], **params)
+                    if rng.random() < 0.2:
+                        other.writer.write(rng.bytes(40).replace(b"\n", b"") + b"\n")
+                await asyncio.sleep(0.2)
+        await asyncio.sleep(5.0)
+        await client.call("halt")
+        await asyncio.sleep(BRAKING)
+        assert not robot.course.is_moving
+        assert (await client.call("status"))["robot"] == "trial"
 
     operated(tmp_path, scenario)
 

@@ -50,6 +50,7 @@ def test_the_example_explains_every_key_and_its_comments_show_the_defaults():
                 if getattr(bound, item.name) != default and item.name not in (
                     "url",
                     "token_file",
+                    "token_credential",
                     "known_labels",
                     "zones",
                     "wake_pin",

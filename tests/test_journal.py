@@ -317,3 +317,42 @@ def test_kill_9_loses_no_stop_that_was_reported(tmp_path):
             stops = [stop for stop in journal.survey("room").stops if stop.leg == leg]
         assert len(stops) >= last
         assert [stop.odometry.x for stop in stops] == [float(number) for number in range(1, len(stops) + 1)]
+
+
+# ---- rejected stops --------------------------------------------------------------------------------------------------
+
+
+def test_a_journal_of_the_version_before_is_taken_over_with_its_stops(tmp_path):
+    with Journal.open(tmp_path / "j") as journal:
+        journal.begin_leg(HEADER)
+        journal.add_stop(HEADER.survey, make_stop(1))
+    with sqlite3.connect(tmp_path / "j") as connection:
+        for column in ("replaces", "rejected", "original"):
+            connection.execute(f"ALTER TABLE stops DROP COLUMN {column}")
+        connection.execute("PRAGMA user_version = 1")
+    connection.close()
+    with Journal.open(tmp_path / "j") as journal:
+        assert journal.survey(HEADER.survey).stops == (make_stop(1),)
+        journal.reject(HEADER.survey, 1, 1, "a person stood there")
+        assert journal.stops(HEADER.survey)[0].rejected == "a person stood there"
+
+
+def test_a_rejected_stop_waits_for_the_server_again_and_names_what_it_replaces(tmp_path):
+    with Journal.open(tmp_path / "j") as journal:
+        journal.begin_leg(HEADER)
+        journal.add_stop(HEADER.survey, make_stop(1))
+        for upload in journal.pending():
+            journal.acknowledge(upload)
+        assert journal.waiting() == 0
+        before = digest(stop_body(make_stop(1)))
+        journal.reject(HEADER.survey, 1, 1, "x")
+        (rejected,) = journal.pending()
+        assert rejected.replaces == before
+        assert journal.survey(HEADER.survey).stops[0].sightings == ()
+        journal.restore(HEADER.survey, 1, 1)
+        (restored,) = journal.pending()
+        assert (restored.digest, restored.replaces) == (before, rejected.digest)
+        summary = journal.surveys()[HEADER.survey]
+        assert (summary.legs, summary.stops, summary.rejected, summary.waiting) == (1, 1, 0, 1)
+        journal.acknowledge(rejected)  # of before: it says nothing about what waits now
+        assert journal.waiting() == 1

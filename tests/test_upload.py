@@ -20,9 +20,9 @@ from robotd.clock import now, run_virtual
 from robotd.errors import InputError, UploadError
 from robotd.files import map_to_json
 from robotd.journal import Journal
-from robotd.journal_records import digest
-from robotd.records import CameraModel, Map, Pose, Rig, SolverRun, Stop, Survey, Transform
-from robotd.server.store import Store
+from robotd.journal_records import digest, stop_body
+from robotd.records import CameraModel, Map, Pose, Rig, Sighting, SolverRun, Stop, Survey, Transform
+from robotd.server.store import ConflictError, Store
 from robotd.upload import Uploader
 
 CAMERA = CameraModel("front", (640, 480), (268.5, 268.5, 319.5, 239.5), Transform((0.0, 0.0, 0.0), (0.06, 0.0, 0.5)))
@@ -399,3 +399,28 @@ def test_the_map_is_fetched_in_no_virtual_time(journal):
 def test_addresses_that_are_none_are_refused(journal, url):
     with pytest.raises(InputError, match="expected an address like https://"):
         Uploader(journal, url, None, 5.0, 30.0, print)
+
+
+def test_a_rejected_stop_replaces_what_the_server_has_and_nothing_else_does(tmp_path, journal):
+    sighted = replace(make_stop(1), sightings=(Sighting("front", "A1", 1.0, 2.0),))
+    journal.add_stop(HEADER.survey, sighted)
+    journal.reject(HEADER.survey, 1, 1, "x")
+
+    async def main():
+        async with uploading(journal, script.url) as up:
+            await up.uploader.wait_empty()
+
+    with scripted() as script:
+        run_virtual(main())
+    _, _, headers, body = script.requests[1]
+    old = stop_body(sighted)
+    assert headers["If-Match"] == f'"{digest(old)}"'
+    store = Store(tmp_path / "server")
+    store.put_header(HEADER.survey, script.requests[0][3])
+    assert store.put_stop(HEADER.survey, 1, 1, old)
+    with pytest.raises(ConflictError):
+        store.put_stop(HEADER.survey, 1, 1, body)
+    with pytest.raises(ConflictError):
+        store.put_stop(HEADER.survey, 1, 1, body, "0" * 64)
+    assert store.put_stop(HEADER.survey, 1, 1, body, digest(old))
+    assert not store.put_stop(HEADER.survey, 1, 1, body, digest(old))  # the same once more, after a lost answer

@@ -6,22 +6,21 @@ was typed goes into that command. Keys, agents, jump hosts and connection sharin
 
 from __future__ import annotations
 
+import _socket  # because the module socket takes an eighth of the start
 import contextlib
 import errno
 import json
 import os
 import select
-import shlex
-import socket
-import subprocess
 import sys
 import time
 from collections import deque
 
 from .errors import NO_CONNECTION, NO_DAEMON, NO_PERMISSION, OTHER_VERSION, REFUSED, USAGE, CtlError
 
-TYPE_CHECKING = False  # typing costs a fifth of the start
+TYPE_CHECKING = False  # what is imported only when it is needed would take as long as all else
 if TYPE_CHECKING:
+    import subprocess
     from typing import Any
 
 SOCKET = "/run/robotd/control.sock"
@@ -37,9 +36,9 @@ def socket_path(given: str | None) -> str:
     return given or os.environ.get("ROBOTCTL_SOCKET") or SOCKET
 
 
-def open_socket(path: str) -> socket.socket:
+def open_socket(path: str) -> _socket.socket:
     """Connect to a daemon on this computer; raises CtlError in words."""
-    channel = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    channel = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
     try:
         channel.connect(path)
     except OSError as error:
@@ -56,6 +55,8 @@ def open_socket(path: str) -> socket.socket:
 
 def ssh_command(target: str, remote: str = REMOTE) -> list[str]:
     """The command that runs robotctl on a robot; raises CtlError if the target is not ssh://[user@]host[:port]."""
+    import shlex
+
     user, host, port = parse_target(target)
     # an interrupted network is noticed; a user's own settings for the host are kept for all else
     command = [*shlex.split(os.environ.get("ROBOTCTL_SSH", "ssh")), "-T"]
@@ -104,7 +105,7 @@ class Connection:
     def __init__(self, target: str | None, path: str | None = None) -> None:
         self._target = target
         self._process: subprocess.Popen[bytes] | None = None
-        self._socket: socket.socket | None = None
+        self._socket: _socket.socket | None = None
         self._rest = b""
         self._notes: deque[dict[str, Any]] = deque()
         self._number = 0
@@ -112,6 +113,8 @@ class Connection:
             self._socket = open_socket(socket_path(path))
             self._in = self._out = self._socket.fileno()
         else:
+            import subprocess
+
             command = ssh_command(target)
             try:
                 self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -135,6 +138,8 @@ class Connection:
         if self._socket is not None:
             self._socket.close()
         if self._process is not None:
+            import subprocess
+
             for pipe in (self._process.stdin, self._process.stdout):
                 if pipe is not None:
                     with contextlib.suppress(OSError):
@@ -221,6 +226,8 @@ class Connection:
         """The other end has hung up: say why."""
         if self._process is None:
             raise CtlError(NO_CONNECTION, "robotd has ended; see why: journalctl -u robotd -e")
+        import subprocess
+
         try:
             code = self._process.wait(5.0)
         except subprocess.TimeoutExpired:
@@ -248,21 +255,21 @@ def answer(message: dict[str, Any]) -> Any:
 
 def dial_stdio(path: str | None) -> int:
     """Join the control socket to standard input and output, for `-H`; returns the exit code."""
-    with open_socket(socket_path(path)) as channel:
-        poll = select.poll()
-        poll.register(0, select.POLLIN)
-        poll.register(channel, select.POLLIN)
-        while True:
-            for fd, _ in poll.poll():
-                source, target = (0, channel.fileno()) if fd == 0 else (channel.fileno(), 1)
-                try:
-                    data = os.read(source, 1 << 16)
-                    if not data:
-                        return 0
-                    while data:
-                        data = data[os.write(target, data) :]
-                except OSError:
+    channel = open_socket(socket_path(path))
+    poll = select.poll()
+    poll.register(0, select.POLLIN)
+    poll.register(channel.fileno(), select.POLLIN)
+    while True:
+        for fd, _ in poll.poll():
+            source, target = (0, channel.fileno()) if fd == 0 else (channel.fileno(), 1)
+            try:
+                data = os.read(source, 1 << 16)
+                if not data:
                     return 0
+                while data:
+                    data = data[os.write(target, data) :]
+            except OSError:
+                return 0
 
 
 def warn(text: str) -> None:

@@ -49,9 +49,9 @@ def status(arguments: Namespace) -> int:
 def status_text(answer: dict[str, Any]) -> str:
     """One screen."""
     mission, uploads, pose = answer["mission"], answer["uploads"], answer["pose"]
-    clock = "" if answer["clock_is_synchronised"] else "  (not set by a time server)"
+    clock = "" if answer["clock_is_synchronised"] else ", not set by a time server"
     rows = [
-        ("robot", f"{answer['robot']}  robotd {answer['robotd']}"),
+        ("robot", f"{answer['robot']}, robotd {answer['robotd']}"),
         ("clock", f"{answer['utc'].replace('T', ' ').replace('+00:00', ' UTC')}{clock}"),
         ("pose", pose_text(pose)),
         ("motion", motion_text(pose)),
@@ -94,7 +94,7 @@ def _drivers_text(drivers: list[dict[str, Any]]) -> str:
         (item["name"], item["kind"], item["driver"], item["state"], item["restarts"], _counters_text(item["counters"]))
         for item in drivers
     ]
-    text = table(("driver", "kind", "by", "state", "restarts", ""), rows)
+    text = table(("driver", "kind", "by", "state", "again", ""), rows)
     faults = [line for item in drivers if item["fault"] for line in _indented(item["fault"])]
     return "\n".join([text, *faults])
 
@@ -114,7 +114,7 @@ def _counters_text(counters: dict[str, float]) -> str:
         )
     if "frames" in counters:
         bad = counters["bad_length"] + counters["bad_order"] + counters["bad_checksum"]
-        return f"{counters['frames']:g} frames, {counters['missing']:g} missing, {bad:g} bad, {counters['late']:g} late"
+        return f"{counters['missing']:.0f} of {counters['frames']:.0f} missing, {bad:.0f} bad"
     return ""
 
 

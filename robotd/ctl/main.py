@@ -188,13 +188,24 @@ GROUPS = {
 }
 
 
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Knows its width without shutil, whose import takes a tenth of the start."""
+
+    def __init__(self, prog: str) -> None:
+        try:
+            columns = os.get_terminal_size(1).columns
+        except OSError:
+            columns = 100
+        super().__init__(prog, width=max(40, columns - 2))
+
+
 def parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     """The command line; with `words` only the command that they name, because building all takes as long as a start."""
     top = argparse.ArgumentParser(
         prog="robotctl",
         description="Command a robot that runs robotd, here or over ssh.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_Formatter,
     )
     _add_common(top, suppress=False)
     top.add_argument("--version", action="version", version=f"robotctl {__version__}")
@@ -208,11 +219,11 @@ def parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
         where = commands
         if second:
             if first not in groups:
-                group = commands.add_parser(first, help=GROUPS[first])
+                group = commands.add_parser(first, help=GROUPS[first], formatter_class=_Formatter)
                 groups[first] = group.add_subparsers(dest="subcommand", required=True, metavar="COMMAND")
             where = groups[first]
         extra: dict[str, Any] = {"help": text, "description": text[:1].upper() + text[1:]} if text else {}
-        command = where.add_parser(second or first, **extra)
+        command = where.add_parser(second or first, formatter_class=_Formatter, **extra)
         for flags, settings in options:
             command.add_argument(*flags, **settings)
         _add_common(command, suppress=True)

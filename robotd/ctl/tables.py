@@ -47,7 +47,7 @@ def pose_text(pose: dict[str, Any] | None) -> str:
     """x, y, heading in words."""
     if pose is None:
         return "unknown"
-    return f"x {pose['x']:.2f}  y {pose['y']:.2f} m  heading {math.degrees(pose['heading']):.0f}\N{DEGREE SIGN}"
+    return f"x {pose['x']:.2f}, y {pose['y']:.2f} m, heading {math.degrees(pose['heading']):.0f}\N{DEGREE SIGN}"
 
 
 def motion_text(pose: dict[str, Any] | None) -> str:
@@ -55,7 +55,7 @@ def motion_text(pose: dict[str, Any] | None) -> str:
     if pose is None:
         return "-"
     turn = math.degrees(pose["turn_rate"])
-    return f"{pose['speed']:.2f} m/s  {turn:.0f}\N{DEGREE SIGN}/s  driven {pose['travelled']:.2f} m"
+    return f"{pose['speed']:.2f} m/s, {turn:.0f}\N{DEGREE SIGN}/s, driven {pose['travelled']:.2f} m"
 
 
 def battery_text(base: dict[str, Any] | None) -> str:
@@ -69,7 +69,7 @@ def battery_text(base: dict[str, Any] | None) -> str:
         parts.append("charging")
     elif base["docked"]:
         parts.append("docked")
-    return "  ".join(parts) or "unknown"
+    return ", ".join(parts) or "unknown"
 
 
 def mode_text(base: dict[str, Any] | None) -> str:
@@ -77,7 +77,7 @@ def mode_text(base: dict[str, Any] | None) -> str:
     if base is None:
         return "the base has not spoken yet"
     senses = [name.replace("_", " ") for name in ("bump", "cliff", "wheel_drop", "slipping") if base[name]]
-    return "  ".join([f"{base['mode']} mode", *senses])
+    return ", ".join([f"{base['mode']} mode", *senses])
 
 
 def mission_text(mission: dict[str, Any]) -> str:
@@ -87,7 +87,7 @@ def mission_text(mission: dict[str, Any]) -> str:
         parts.append(f"stop {mission['stop']} of {mission['stops']}")
     if mission["survey"] is not None:
         parts.append(f"survey {mission['survey']} leg {mission['leg']}, {mission['stops_made']} made")
-    return "  ".join(parts)
+    return ", ".join(parts)
 
 
 def wrapped(text: str, width: int) -> list[str]:

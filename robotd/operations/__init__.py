@@ -1,6 +1,6 @@
 """What operators can ask of the running daemon over its control socket, one module a subject."""
 
-from . import devices, missions, motion, telemetry
+from . import calibrations, devices, missions, motion, settings, telemetry, trials
 from .table import METHODS, Operations
 
-__all__ = ["METHODS", "Operations", "devices", "missions", "motion", "telemetry"]
+__all__ = ["METHODS", "Operations", "calibrations", "devices", "missions", "motion", "settings", "telemetry", "trials"]

@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of everything that parses bytes from a serial line, or about it, with atheris (libFuzzer).
+"""Coverage-guided fuzzing of what parses bytes from a serial line, about it, or from operators, with atheris.
 
     python -m tests.fuzz.fuzz_oi --seconds 30            every target, one after the other, sharing that time
     python -m tests.fuzz.fuzz_oi --target stream FILE    what a saved input does
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
 import os
 import re
 import struct
@@ -157,6 +158,30 @@ def recording(data: bytes) -> None:
         path.unlink()
 
 
+def control(data: bytes) -> None:
+    """A line at the control socket is understood or refused in words, and so are its parameters."""
+    from robotd import rpc
+    from robotd.bind import bind
+    from robotd.errors import ConfigError
+    from robotd.operations import METHODS
+
+    try:
+        request = rpc.parse(data)
+    except rpc.RpcError as error:
+        assert rpc.failure(error).endswith(b"\n")
+        return
+    assert 0 < len(request.method) <= rpc.METHOD_LIMIT
+    for name in (request.method, *METHODS) if len(data) % 8 == 0 else (request.method,):
+        if name in METHODS:
+            try:
+                bind(METHODS[name][0], request.params, name)
+            except ConfigError as error:
+                assert error.problems
+                rpc.failure(rpc.RpcError(rpc.INVALID_PARAMS, *error.problems, id=request.id))
+    if request.id is not None:
+        rpc.result(request.id, dict(request.params))
+
+
 TARGETS: dict[str, Callable[[bytes], None]] = {
     "stream": stream,
     "framed": framed,
@@ -164,6 +189,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "firmware": firmware,
     "guardian": guardian,
     "recording": recording,
+    "control": control,
 }
 
 
@@ -190,6 +216,15 @@ def _seeds(target: str) -> list[bytes]:
         ]
     if target == "guardian":
         return [b"open 115200 /dev/ttyUSB0", b"beat", b"open x y"]
+    if target == "control":
+        words = (
+            ("drive", {"t": 1.5, "speed": 0.1}),
+            ("mission.start", {"survey": "a", "stop": 2}),
+            ("calibrate", {"what": "rig"}),
+        )
+        return [
+            json.dumps({"jsonrpc": "2.0", "id": 1, "method": name, "params": given}).encode() for name, given in words
+        ]
     return [
         b'# base {"baud": 115200}\n0.0 open /dev/x 115200\n0.1 > 80\n0.2 < 1305\n0.3 wish 0.1 0.2 0.3 me\n0.4 close\n'
     ]
@@ -200,10 +235,19 @@ def _run(target: str, seconds: float, files: list[str]) -> None:
     import atheris
 
     with atheris.instrument_imports(
-        include=["robotd.oi", "robotd.oi_packets", "robotd.roomba.firmware", "robotd.serial_log"]
+        include=[
+            "robotd.oi",
+            "robotd.oi_packets",
+            "robotd.roomba.firmware",
+            "robotd.serial_log",
+            "robotd.rpc",
+            "robotd.bind",
+        ]
     ):
+        import robotd.bind
         import robotd.oi
         import robotd.roomba.firmware
+        import robotd.rpc
         import robotd.serial_log  # noqa: F401
     with tempfile.TemporaryDirectory() as corpus:
         for number, seed in enumerate(_seeds(target)):
