@@ -345,7 +345,10 @@ class LineFollowerDriver(Driver):
         if tracker.expected >= SEARCH_LEAST:
             if tracker.see(await in_thread(self._eye.search, tracker.around(SEARCH_NEAR)), relaxed=True):
                 return "searching near"
-            if tracker.see(await in_thread(self._eye.search), relaxed=True, everywhere=True):
+            # one picture without the line is not yet a reason to believe a doubtful piece that lies elsewhere
+            state = self.bus.odometry.latest
+            is_lost = state is not None and tracker.missed(state.travelled) > SLOW_AFTER
+            if is_lost and tracker.see(await in_thread(self._eye.search), relaxed=True, everywhere=True):
                 return "searching all"
         if self._lost.is_turning and tracker.acquire_anew(await in_thread(self._eye.search)):
             return "searching all"
