@@ -6,6 +6,7 @@ before any device is opened.
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import tomllib
@@ -21,7 +22,7 @@ from .identify import IdentifyConfig
 from .odometry import Wheels
 from .records import CameraModel, KnownLabel, Priors, Rig, Sigmas, Vector3
 from .safety import SafetyLimits
-from .toml_edit import assignments, replace_table, toml
+from .toml_edit import assignments, replace_element, replace_table, toml
 
 T = TypeVar("T")
 
@@ -247,6 +248,52 @@ def save_floor_camera(camera: CameraModel, path: Path, note: str) -> None:
     header = next(k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[floor_camera]"))
     lines.insert(header + 1, f"# {note}")
     text = "\n".join(lines) + "\n"
+    bind(Calibration, tomllib.loads(text), str(path))
+    _replace(path, text)
+
+
+def save_lens(camera: CameraModel, path: Path, priors: Priors) -> None:
+    """Write a camera's lens into calibration.toml; its pose and all else in the file stay as they were.
+
+    The camera is [floor_camera] if that has its name, and otherwise one of [[cameras]], which is appended if it is new,
+    with the given pose.
+
+    Parameters
+    ----------
+    camera : CameraModel
+    path : Path
+        Need not exist; replaced atomically.
+    priors : Priors
+        `focal_px` and `centre_px` in the file are raised to these, because a lens that is held to better than it is
+        known bends the map.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or edited.
+    """
+    text, before = "", Calibration()
+    if path.exists():
+        before = load_calibration(path)
+        text = path.read_text(encoding="utf-8")
+    values = assignments(camera)
+    del values["name"]
+    if camera.valid_radius_px is None:  # to the picture's farthest corner, because an older limit must not stay
+        (width, height), (_, _, cx, cy) = camera.size, camera.matrix
+        values["valid_radius_px"] = repr(math.ceil(math.hypot(max(cx, width - cx), max(cy, height - cy))))
+    if before.floor_camera is not None and before.floor_camera.name == camera.name:
+        del values["T_robot_camera"]
+        text = replace_table(text, "floor_camera", values, str(path))
+    else:
+        if any(known.name == camera.name for known in before.cameras):
+            del values["T_robot_camera"]
+        text = replace_element(text, "cameras", camera.name, values, str(path))
+        raised = {
+            name: repr(value)
+            for name in ("focal_px", "centre_px")
+            if (value := getattr(priors, name)) > getattr(before.priors, name)
+        }
+        text = replace_table(text, "priors", raised, str(path)) if raised else text
     bind(Calibration, tomllib.loads(text), str(path))
     _replace(path, text)
 

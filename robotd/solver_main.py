@@ -1,4 +1,4 @@
-"""`robotd-solver`: solve and judge surveys in files, calibrate the floor camera, and serve robots.
+"""`robotd-solver`: solve and judge surveys in files, calibrate cameras, and serve robots.
 
 Exit codes: 0 done, 1 it could not be done, 2 the command or a file is wrong.
 """
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from . import workbench_tool
 from .errors import InputError, RobotdError
+from .lens_commands import add_calibrate_camera
 from .roof_commands import add_calibrate_roof, add_roof
 
 if TYPE_CHECKING:
@@ -147,6 +148,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     floor.add_argument("--picture", type=Path, metavar="PNG", help="also draw the corners' residuals and the top view")
     floor.add_argument("--json", action="store_true", help="print one JSON object")
     floor.set_defaults(run=_calibrate_floor)
+    add_calibrate_camera(kinds)
     add_calibrate_roof(kinds)
 
 

@@ -1,4 +1,4 @@
-"""Change one table of a TOML file and leave every other byte as a person wrote it."""
+"""Change one table of a TOML file, or of an array of tables, and leave every other byte as a person wrote it."""
 
 from __future__ import annotations
 
@@ -72,6 +72,44 @@ def replace_table(text: str, table: str, values: Mapping[str, str], where: str) 
     except tomllib.TOMLDecodeError:
         pass
     raise ConfigError(f"{where}: cannot change {table} where it stands; write it as a section [{table}] of its own")
+
+
+def replace_element(text: str, array: str, name: str, values: Mapping[str, str], where: str) -> str:
+    """Set keys of the element of `[[array]]` whose key `name` has this value and keep all else; see `replace_table`.
+
+    The element is appended, with its name, if there is none.
+
+    Raises
+    ------
+    ConfigError
+        The array is written in a way that cannot be edited line by line.
+    """
+    lines = text.splitlines()
+    expected = tomllib.loads(text)
+    wanted = {"name": name, **tomllib.loads("\n".join(f"{key} = {value}" for key, value in values.items()))}
+    kept = expected.setdefault(array, [])
+    names = [element.get("name") for element in kept] if isinstance(kept, list) else []
+    starts = [index for index, line in enumerate(lines) if re.match(rf"\s*\[\[\s*{re.escape(array)}\s*\]\]", line)]
+    refusal = ConfigError(f"{where}: cannot change {array} where it stands; write each as a section [[{array}]]")
+    if not isinstance(kept, list) or len(starts) != len(names):
+        raise refusal
+    if name in names:
+        at = names.index(name)
+        begin = starts[at] + 1
+        end = next((index for index in range(begin, len(lines)) if _HEADER.match(lines[index])), len(lines))
+        lines[begin:end] = _set(lines[begin:end], values)
+        kept[at] = {**kept[at], **wanted}
+    else:
+        gap = [""] if lines and lines[-1].strip() else []
+        lines += [*gap, f"[[{array}]]", f"name = {toml(name)}", *(f"{key} = {value}" for key, value in values.items())]
+        kept.append(wanted)
+    changed = "\n".join(lines) + "\n"
+    try:
+        if tomllib.loads(changed) == expected:
+            return changed
+    except tomllib.TOMLDecodeError:
+        pass
+    raise refusal
 
 
 def _set(lines: list[str], values: Mapping[str, str]) -> list[str]:

@@ -67,6 +67,8 @@ LAYERS = {
         "demo_roof",
         "roof_tool",
         "roof_commands",
+        "lens_tool",
+        "lens_commands",
         "calibrate",
         "doctor",
         "doctor_checks",

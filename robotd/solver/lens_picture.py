@@ -1,0 +1,70 @@
+"""A lens calibration as one picture: residuals over the view, their scatter, each picture's share."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from .calibrate_lens import LensCalibration
+from .lens_fit import View
+from .report import INK, MUTED
+
+MAGNIFIED = 100.0  # times, the residuals over the view
+ARROW, RING = "#c2410c", "#15803d"
+
+
+def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -> None:
+    """Write a PNG.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written or matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from matplotlib.patches import Circle
+    except ImportError as error:
+        raise InputError(f"{path}: pictures need matplotlib; install robotd[solver]") from error
+    figure = Figure(figsize=(13, 6.2), dpi=120, facecolor="white")
+    FigureCanvasAgg(figure)
+    name = result.camera.name.replace("$", r"\$")
+    figure.text(0.05, 0.94, f"Lens of {name}: {result.kind}, {result.rms_px:.3f} px rms", size=15, color=INK)
+    held = ", ".join(f"{kind} {error:.3f} px" for kind, error in result.held_out_px.items())
+    figure.text(0.05, 0.90, f"held out: {held}", size=9.5, color=MUTED)
+
+    width, height = result.camera.size
+    centre = result.camera.matrix[2:]
+    seen, left = np.concatenate([view.pixels for view in views]), np.concatenate(result.residuals)
+    over = figure.add_axes((0.05, 0.08, 0.5, 0.78))
+    arrows = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / MAGNIFIED, "color": ARROW}
+    over.quiver(*seen.T, *left.T, width=0.0012, headwidth=3, **arrows)
+    over.add_patch(Circle(centre, result.reach_px, fill=False, color=RING, linewidth=1.6))
+    over.plot(*centre, "+", color=RING, markersize=10)
+    over.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="u (px)", ylabel="v (px)")
+    over.set_title(f"residuals x {MAGNIFIED:.0f}; green: the lens holds inside", size=10, color=INK)
+
+    most = 1.1 * max(float(np.abs(left).max()), 0.1)
+    scatter = figure.add_axes((0.62, 0.5, 0.2, 0.36))
+    scatter.plot(*left.T, ".", color=ARROW, markersize=2.5)
+    scatter.add_patch(Circle((0.0, 0.0), 2.0 * result.rms_px, fill=False, color=MUTED))
+    scatter.set(xlim=(-most, most), ylim=(most, -most), aspect="equal", xlabel="du (px)", ylabel="dv (px)")
+    scatter.set_title("scatter; circle: 2 rms", size=10, color=INK)
+
+    share = figure.add_axes((0.62, 0.08, 0.35, 0.3))
+    each = [float(np.sqrt(np.mean(one**2))) for one in result.residuals]
+    share.bar(np.arange(1, len(each) + 1), each, color=MUTED)
+    share.axhline(result.rms_px, color=ARROW, linewidth=1.0)
+    share.set(xlabel="picture", ylabel="rms (px)")
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    try:
+        path.write_bytes(buffer.getvalue())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error

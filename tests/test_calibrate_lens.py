@@ -1,0 +1,358 @@
+"""`robotd-solver calibrate camera`: lenses from drawn boards, which model, how sure, what is missing, MATLAB."""
+
+import json
+import math
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from robotd.config import Calibration, load_calibration, save_calibration
+from robotd.errors import ConfigError, InputError, SolverError
+from robotd.geometry.camera import Camera
+from robotd.geometry.transforms import rotation_matrix
+from robotd.records import CameraModel, Transform
+from robotd.solver.calibrate_floor import Board
+from robotd.solver.calibrate_lens import _choose, calibrate_lens
+from robotd.solver.lens_fit import View, camera_model, fit_lens, lens_jacobian, refine
+from robotd.solver.matlab_lens import load_matlab
+from robotd.solver_main import main
+from robotd.toml_edit import replace_element
+
+SIZE = (640, 480)
+BOARD = Board(9, 6, 0.03)
+POINTS = np.column_stack([BOARD.corners * [1.0, -1.0], np.zeros(54)])
+BROWN = np.array([420.0, 418.0, 322.0, 238.0, -0.30, 0.10, 0.0005, -0.0004, -0.015])
+FISHEYE = np.array([200.0, 201.0, 318.0, 242.0, 0.03, -0.01, 0.002, -0.0005])
+
+
+def poses(kind, lens, count, seed, tilt=0.7, near=0.2, far=0.7, middle=0.0):
+    """Boards that lie wholly in the picture, facing the camera but for a tilt, their middles all over it."""
+    rng, camera = np.random.default_rng(seed), Camera(camera_model(kind, lens, SIZE))
+    out = []
+    while len(out) < count:
+        at = rng.uniform(np.array(SIZE) * middle, np.array(SIZE) * (1.0 - middle))
+        (ray,), (valid,) = camera.rays(at[None])
+        turn = rotation_matrix(rng.uniform(-tilt, tilt, 3))
+        distance = rng.uniform(near, far)
+        if not valid:
+            continue
+        axis = np.cross([0.0, 0.0, 1.0], ray)
+        sine = float(np.linalg.norm(axis))
+        facing = rotation_matrix(axis / max(sine, 1e-9) * math.atan2(sine, ray[2]))
+        R = (facing @ turn) if tilt > 0.1 else turn
+        pixels, valid = camera.project(POINTS @ R.T + ray * distance)
+        if valid.all() and camera.in_image(pixels, 12.0).all():
+            out.append((R, ray * distance, pixels))
+    return out
+
+
+def views(kind, lens, count=20, seed=0, noise=0.1, **how):
+    rng = np.random.default_rng(1000 + seed)
+    return [
+        View(f"picture {k}", POINTS, pixels + rng.normal(0.0, noise, pixels.shape))
+        for k, (_, _, pixels) in enumerate(poses(kind, lens, count, seed, **how))
+    ]
+
+
+# ---- the fit ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["brown-conrady", "rational", "fisheye"])
+def test_derivatives_by_the_lens_are_those_of_the_camera(kind):
+    rng = np.random.default_rng(3)
+    lens = {"brown-conrady": BROWN, "rational": np.array([*BROWN, 0.05, 0.02, 0.01]), "fisheye": FISHEYE}[kind]
+    points = rng.uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.0], (20, 3))
+    found = lens_jacobian(kind, lens, points)
+    for k in range(len(lens)):
+        step = np.zeros(len(lens))
+        step[k] = 1e-6 * max(abs(lens[k]), 1.0)
+        ends = [Camera(camera_model(kind, lens + way * step, SIZE)).project(points)[0] for way in (1.0, -1.0)]
+        assert found[:, :, k] == pytest.approx((ends[0] - ends[1]) / (2.0 * step[k]), abs=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "lens"), [("brown-conrady", BROWN), ("fisheye", FISHEYE)])
+def test_the_stated_uncertainty_is_that_of_the_errors(kind, lens):
+    """NEES of fx, fy, cx, cy over seeds: its mean is 4, its standard deviation over n seeds sqrt(8 / n)."""
+    count = 40
+    scenes = poses(kind, lens, 12, seed=0)
+    rng = np.random.default_rng(8)
+    exact = [View(str(k), POINTS, pixels) for k, (_, _, pixels) in enumerate(scenes)]
+    start = fit_lens(kind, exact, SIZE)
+    assert start.lens == pytest.approx(lens, abs=1e-3)
+    nees = []
+    for _ in range(count):
+        noisy = [View(v.name, v.points, v.pixels + rng.normal(0.0, 0.2, v.pixels.shape)) for v in exact]
+        fit = refine(start, noisy, SIZE)
+        scatter = fit.cost / (fit.residuals.size - len(lens) - 6 * len(noisy))
+        covariance = scatter * np.linalg.inv(fit.information)[:4, :4]
+        error = fit.lens[:4] - lens[:4]
+        nees.append(error @ np.linalg.solve(covariance, error))
+    assert abs(np.mean(nees) / 4.0 - 1.0) < 3.0 * math.sqrt(8.0 / count) / 4.0
+
+
+@cache
+def calibrated(kind):
+    lens = FISHEYE if kind == "fisheye" else BROWN
+    return calibrate_lens(views(kind, lens), SIZE, "front")
+
+
+@pytest.mark.parametrize(("kind", "lens"), [("brown-conrady", BROWN), ("fisheye", FISHEYE)])
+def test_a_lens_is_recovered_within_its_stated_sigma_by_the_model_that_made_it(kind, lens):
+    result = calibrated(kind)
+    assert result.kind == kind
+    assert result.camera.model == kind
+    assert result.rms_px == pytest.approx(0.1, rel=0.1)
+    error = np.array(result.camera.matrix) - lens[:4]
+    assert (np.abs(error) < 3.5 * result.sigmas).all()
+    assert result.sigmas.max() < 1.0
+    wrong = "brown-conrady" if kind == "fisheye" else "fisheye"
+    assert result.held_out_px[wrong] > result.held_out_px[kind]
+
+
+def test_the_lens_is_called_valid_as_far_as_corners_reached():
+    scene = views("brown-conrady", BROWN)
+    result = calibrated("brown-conrady")
+    away = np.concatenate([np.linalg.norm(v.pixels - result.camera.matrix[2:], axis=1) for v in scene])
+    assert result.reach_px <= away.max()
+    assert result.camera.valid_radius_px == pytest.approx(result.reach_px, abs=0.1)
+    truth, found = Camera(camera_model("brown-conrady", BROWN, SIZE)), Camera(result.camera)
+    angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    rim = np.array(BROWN[2:4]) + 0.95 * result.reach_px * np.column_stack([np.cos(angle), np.sin(angle)])
+    rim = rim[truth.in_image(rim)]
+    (a, _), (b, valid) = truth.rays(rim), found.rays(rim)
+    assert valid.all()
+    assert np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))).max() < 0.2
+
+
+def test_a_gain_of_nothing_is_not_worth_more_coefficients():
+    rng = np.random.default_rng(1)
+    plain = rng.uniform(0.009, 0.011, 20)
+    assert _choose({"brown-conrady": plain, "rational": 0.995 * plain}) == "brown-conrady"
+    assert _choose({"brown-conrady": plain, "rational": 0.8 * plain}) == "rational"
+    assert _choose({"brown-conrady": np.full(20, np.inf), "fisheye": plain}) == "fisheye"
+
+
+# ---- what is missing -------------------------------------------------------------------------------------------------
+
+
+def refused(scene, words, whole=True):
+    with pytest.raises(SolverError, match=words):
+        calibrate_lens(scene, SIZE, "front", ("brown-conrady",), whole)
+
+
+def test_too_few_pictures_are_refused_and_repeated_ones_count_once():
+    scene = views("brown-conrady", BROWN, 8)
+    refused(scene[:5], "5 different pictures; take 8 or more")
+    refused(scene[:5] * 4, r"5 different pictures \(20, but in some the board did not move\)")
+
+
+def test_boards_without_tilt_are_refused():
+    refused(views("brown-conrady", BROWN, tilt=0.02), "tilt them by 30 to 45 degrees", whole=False)
+
+
+def test_corners_that_leave_out_a_border_are_refused_and_the_border_named():
+    scene = views("brown-conrady", BROWN, 25)
+    left = [View(v.name, v.points, v.pixels * [0.6, 1.0]) for v in scene]
+    refused(left, r"no corner lies near the right \(\d+ %\) border")
+    middle = views("brown-conrady", BROWN, 20, middle=0.42, near=0.5)
+    refused(middle, "border, where the lens bends most")
+
+
+def test_boards_at_one_distance_are_refused():
+    refused(views("brown-conrady", BROWN, near=0.38, far=0.4), "all at nearly the same distance", whole=False)
+
+
+def test_a_picture_that_does_not_belong_is_named():
+    scene = views("brown-conrady", BROWN)
+    scene[7] = View("bent", POINTS, scene[7].pixels + 3.0 * np.sin(np.arange(108).reshape(54, 2)))
+    refused(scene, "worst bent with")
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+
+def drawn(texture, scale, R, t, seed=0):
+    """What a Brown-Conrady camera sees of a board, texture (H, W) with `scale` pixels per metre around its middle."""
+    rays, valid = rays_of_brown()
+    R, t = R.astype(np.float32), t.astype(np.float32)
+    normal = R[:, 2]
+    far = (normal @ t) / (rays @ normal)
+    on = (rays * far[:, None] - t) @ R[:, :2]
+    at = on * np.float32(scale) + 0.5 * (np.array(texture.shape[::-1], np.float32) - 1.0)
+    at[~valid | (far <= 0.0)] = -1e4
+    at = at.reshape(960, 1280, 2)
+    big = cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=215)
+    grey = cv2.resize(cv2.GaussianBlur(big.astype(np.float32), (0, 0), 1.4), SIZE, interpolation=cv2.INTER_AREA)
+    noise = np.random.default_rng(seed).normal(0.0, 1.5, grey.shape)
+    return np.clip(grey + noise, 0, 255).astype(np.uint8)
+
+
+@cache
+def rays_of_brown():
+    v, u = np.mgrid[0:960, 0:1280]
+    camera = Camera(camera_model("brown-conrady", BROWN, SIZE))
+    rays, valid = camera.rays(np.column_stack([(u.ravel() + 0.5) / 2 - 0.5, (v.ravel() + 0.5) / 2 - 0.5]))
+    return np.nan_to_num(rays, nan=1.0).astype(np.float32), valid
+
+
+def chessboard_texture(scale=2000):
+    square = round(BOARD.square * scale)
+    y, x = np.mgrid[0 : 9 * square, 0 : 12 * square]
+    i, j = x // square, y // square
+    inside = (i > 0) & (i < 11) & (j > 0) & (j < 8)
+    return np.where(inside & ((i + j) % 2 == 0), 30, 215).astype(np.uint8)
+
+
+def charuco_texture():
+    board = cv2.aruco.CharucoBoard((10, 7), 0.03, 0.0225, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    return np.clip(board.generateImage((600, 420)), 30, 215).astype(np.uint8)
+
+
+@pytest.fixture(scope="module", params=["--board", "--charuco"])
+def pictures(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pictures")
+    texture = chessboard_texture() if request.param == "--board" else charuco_texture()
+    paths = []
+    for k, (R, t, _) in enumerate(poses("brown-conrady", BROWN, 10, seed=4, tilt=0.6, near=0.2, far=0.5)):
+        paths.append(str(folder / f"front-{k:03d}.png"))
+        assert cv2.imwrite(paths[-1], drawn(texture, 2000.0, R, t, seed=k))
+    asked = ["9x6", "--model", "brown-conrady"] if request.param == "--board" else ["10x7"]
+    return paths, [request.param, *asked, "--square", "0.03"]
+
+
+def calibration(path):
+    mount = Transform((-1.2, 1.2, -1.2), (0.06, 0.0, 0.5))
+    cameras = tuple(CameraModel(n, SIZE, (300.0, 300.0, 320.0, 240.0), mount) for n in ("rear", "front"))
+    save_calibration(Calibration(cameras=cameras, gamma=2.0), path)
+    path.write_text("# measured in the hall\n" + path.read_text())
+    return mount
+
+
+def test_the_command_finds_the_corners_and_writes_the_lens_alone(pictures, tmp_path, capsys):
+    paths, board = pictures
+    file, png = tmp_path / "calibration.toml", tmp_path / "residuals.png"
+    mount = calibration(file)
+    asked = ["calibrate", "camera", *paths, *board, "--camera", "front", "--calibration", str(file)]
+    assert main([*asked, "--json", "--picture", str(png)]) == 0
+    out = capsys.readouterr()
+    numbers = json.loads(out.out)
+    written = load_calibration(file)
+    front = written.camera("front")
+    assert numbers["matrix"] == list(front.matrix)
+    assert front.T_robot_camera == mount
+    assert front.valid_radius_px == numbers["valid_radius_px"]
+    assert written.camera("rear").matrix == (300.0, 300.0, 320.0, 240.0)
+    assert written.gamma == 2.0
+    assert written.priors.focal_px == pytest.approx(max(numbers["sigma_px"][:2]), abs=1e-3)
+    assert file.read_text().startswith("# measured in the hall\n")
+    assert numbers["rms_px"] < 0.15
+    assert front.matrix == pytest.approx(BROWN[:4], abs=1.5)
+    assert "held out" in out.err
+    assert cv2.imread(str(png)).shape[1] > 1000
+
+
+def test_every_useless_picture_is_named_at_once(tmp_path, capsys):
+    blank, small, text = (str(tmp_path / name) for name in ("blank.png", "small.png", "text.png"))
+    assert cv2.imwrite(blank, np.full((480, 640), 90, np.uint8))
+    assert cv2.imwrite(small, np.zeros((240, 320), np.uint8))
+    (tmp_path / "text.png").write_text("no picture")
+    file = tmp_path / "calibration.toml"
+    asked = [blank, small, text, str(tmp_path / "gone.png"), "--board", "9x6", "--square", "0.03", "--camera", "front"]
+    assert main(["calibrate", "camera", *asked, "--calibration", str(file)]) == 2
+    said = capsys.readouterr().err
+    for words in ("blank.png: the board is not seen", "small.png: is 320x240", "text.png: cannot be read", "gone.png"):
+        assert words in said, words
+    assert main(["calibrate", "camera", "--camera", "front", "--calibration", str(file)]) == 2
+    said = capsys.readouterr().err
+    assert "no pictures given" in said
+    assert "give --square" in said
+    assert not file.exists()
+
+
+def test_a_folder_of_the_robot_says_which_board_it_was(tmp_path, capsys):
+    data = {
+        "format": "robotd-calibration-data/1", "what": "camera", "camera": "front", "robot": "r",
+        "board": {"columns": 9, "rows": 6, "square_m": 0.03},
+        "pictures": [{"file": f"{k}.png", "camera": "front", "board_found": k < 3} for k in range(5)],
+    }  # fmt: skip
+    for k, (R, t, _) in enumerate(poses("brown-conrady", BROWN, 3, seed=4, tilt=0.6, near=0.2, far=0.5)):
+        assert cv2.imwrite(str(tmp_path / f"{k}.png"), drawn(chessboard_texture(), 2000.0, R, t))
+    (tmp_path / "data.json").write_text(json.dumps(data))
+    asked = ["calibrate", "camera", str(tmp_path), "--calibration", str(tmp_path / "c.toml"), "--camera"]
+    assert main([*asked, "front"]) == 1
+    assert "3 different pictures; take 8" in capsys.readouterr().err
+    assert main([*asked, "rear"]) == 2
+    assert "pictures of camera front" in capsys.readouterr().err
+    (tmp_path / "data.json").write_text("{}")
+    assert main([*asked, "front"]) == 2
+    assert "data.json: is not what" in capsys.readouterr().err
+
+
+# ---- the file, MATLAB ------------------------------------------------------------------------------------------------
+
+
+def test_an_element_of_an_array_is_changed_and_every_other_byte_stays():
+    text = '# top\n[[cameras]]\nname = "a"\nf = 1 # old\n\n[[cameras]]  # 2\nname = "b"\nf = 2\n[cameras.deep]\nx = 1\n'
+    changed = replace_element(text, "cameras", "b", {"f": "5", "g": "6"}, "c.toml")
+    assert changed == text.replace("f = 2\n", "f = 5\ng = 6\n")
+    assert replace_element(text, "cameras", "a", {"f": "3"}, "c.toml") == text.replace("f = 1", "f = 3")
+    assert replace_element(text, "cameras", "c", {"f": "3"}, "c.toml").startswith(text)
+    with pytest.raises(ConfigError, match=r"c.toml: cannot change cameras"):
+        replace_element('cameras = [{name = "a"}]\n', "cameras", "a", {"f": "3"}, "c.toml")
+
+
+MATLAB = {
+    "RadialDistortion": [-0.3, 0.1, -0.015],
+    "TangentialDistortion": [0.0005, -0.0004],
+    "ImageSize": [480, 640],
+    "IntrinsicMatrix": [[420.0, 0.0, 0.0], [0.0, 418.0, 0.0], [323.0, 239.0, 1.0]],
+}
+
+
+def test_matlabs_lens_is_ours_with_the_centre_one_pixel_less(tmp_path, capsys):
+    fields = {name: np.array(value, dtype=float) for name, value in MATLAB.items()}
+    savemat(tmp_path / "lens.mat", fields)
+    savemat(tmp_path / "struct.mat", {"s": fields})
+    (tmp_path / "lens.json").write_text(json.dumps(MATLAB))
+    K = {**MATLAB, "K": np.array(MATLAB["IntrinsicMatrix"]).T.tolist()}
+    del K["IntrinsicMatrix"]
+    (tmp_path / "new.json").write_text(json.dumps({"cameraParams": K}))
+    for name in ("lens.mat", "struct.mat", "lens.json", "new.json"):
+        file = tmp_path / "calibration.toml"
+        mount = calibration(file)
+        asked = ["--matlab", str(tmp_path / name), "--camera", "front", "--calibration", str(file)]
+        assert main(["calibrate", "camera", *asked]) == 0
+        front = load_calibration(file).camera("front")
+        assert front.matrix == pytest.approx((420.0, 418.0, 322.0, 238.0))
+        assert front.distortion == pytest.approx((-0.3, 0.1, 0.0005, -0.0004, -0.015))
+        assert front.size == SIZE
+        assert front.T_robot_camera == mount
+        assert "less one pixel" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"ImageSize": []}, "give --size"),
+        ({"RadialDistortion": [0.1]}, "RadialDistortion: found"),
+        ({"RadialDistortion": "x"}, "RadialDistortion: found"),
+        ({"IntrinsicMatrix": [[1.0]]}, "expected 3x3"),
+        ({"IntrinsicMatrix": [[420.0, 0.0, 0.0], [2.0, 418.0, 0.0], [323.0, 239.0, 1.0]]}, "skew"),
+        ({"IntrinsicMatrix": [[420.0, 0.0, 0.0], [0.0, 418.0, 0.0], [9e3, 239.0, 1.0]]}, "lies outside the picture"),
+        ({"MappingCoefficients": [1.0, 0.0, 0.0, 0.0]}, "fisheye model"),
+    ],
+)
+def test_what_matlab_says_and_we_cannot_is_refused(change, words):
+    with pytest.raises(InputError, match=words):
+        load_matlab(json.dumps({**MATLAB, **change}).encode(), "lens.json", "front")
+
+
+def test_files_that_hold_no_lens_say_how_to_save_one():
+    for data in (b"", b"MATLAB 5.0 MAT-file" + bytes(300), b"{", b"[1, 2]", b'{"a": 1}'):
+        with pytest.raises(InputError, match=r"lens\.x"):
+            load_matlab(data, "lens.x", "front")
+    with pytest.raises(InputError, match="toStruct"):
+        load_matlab(b'{"a": 1}', "lens.x", "front")
