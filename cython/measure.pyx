@@ -5,6 +5,7 @@ Their plain versions are in robotd/vision/measure_reference.py, which also says 
 
 from libc.math cimport M_PI, atan2, atan2f, fabsf, floor, floorf, logf, sqrt, sqrtf
 
+cdef float MOST_SLOPE = 0.08  # of the width along the line, that bends and tilted views explain
 cdef float OUT_OF_VIEW = 1.5  # widths that an end beyond the view counts for
 
 
@@ -79,6 +80,8 @@ def judge(
     cdef float w, spacing, half, level, reach, value, inner, along, mean_left, mean_right, scatter, contrast, turn, total
     cdef float low, weaker, near
     cdef int nears
+    cdef float[2] beyond  # contrast with the floor farther off, by side
+    cdef int[2] beyonds
     cdef float[2] t
     cdef float[2] before
     cdef float[3] inside
@@ -94,6 +97,9 @@ def judge(
             shown = 0
             inner = mean_left = mean_right = near = 0.0
             nears = 0
+            for side in range(2):
+                beyond[side] = 0.0
+                beyonds[side] = 0
             for i in range(n):
                 _tangent(path, n, i, 1, t)
                 half = 0.5 * (w + pieces[p, 3] * pieces[p, 10] * (<float> i / <float> (n - 1) - 0.5))
@@ -125,6 +131,21 @@ def judge(
                     continue
                 for k in range(3):
                     inner += fabsf(inside[k] - level)
+                for side in range(2):
+                    turn = 0.0
+                    few = 0
+                    for k in range(3):
+                        reach = half + (<float> 1.5 + <float> 0.5 * k) * (half if half > 4.0 else <float> 4.0)
+                        reach = reach if side == 1 else -reach
+                        value = _at(
+                            grey, mask, masked, height, width, path[2 * i] - reach * t[1], path[2 * i + 1] + reach * t[0]
+                        )
+                        if value >= 0.0:
+                            turn += value
+                            few += 1
+                    if few > 0:
+                        beyond[side] += sign * (level - turn / few)
+                        beyonds[side] += 1
                 # how much of the step lies right at the borders
                 reach = 0.3 * half if half > 5.0 else <float> 1.5
                 for side in range(2):
@@ -145,7 +166,7 @@ def judge(
                 mean_left += left[shown]
                 mean_right += right[shown]
                 shown += 1
-            for k in range(16):
+            for k in range(17):
                 out[p, k] = 0.0
             if shown < 3:
                 continue
@@ -189,7 +210,8 @@ def judge(
                 if _at(grey, mask, masked, height, width, path[2 * n - 2] + w * t[0], path[2 * n - 1] + w * t[1]) < 0.0:
                     value += OUT_OF_VIEW
             out[p, 1] = _log(value, 0.5, 15.0)
-            out[p, 2] = pieces[p, 5] / pieces[p, 6] if pieces[p, 6] > 0.0 else <float> 1.0
+            value = 10.0 * (fabsf(pieces[p, 3]) - MOST_SLOPE)
+            out[p, 2] = 0.0 if value < 0.0 else (2.0 if value > 2.0 else value)
             out[p, 3] = _log(near / (nears if nears > 0 else 1) / (0.7 * contrast), 0.3, 1.0)
             value = 10.0 * pieces[p, 4] / w
             out[p, 4] = 0.1 if value < 0.1 else (2.0 if value > 2.0 else value)
@@ -197,7 +219,7 @@ def judge(
             out[p, 5] = 0.1 if value < 0.1 else (2.0 if value > 2.0 else value)
             out[p, 6] = _log(contrast / (scatter + 1.0), 0.2, 12.0)
             out[p, 7] = _log(contrast, 1.0, 60.0)
-            out[p, 8] = _log(low / contrast, 0.05, 1.0)
+            out[p, 8] = _log(low / (0.65 * contrast), 0.1, 1.0)
             out[p, 9] = <float> good / <float> shown
             out[p, 10] = _log(contrast / (inner + 1.0), 0.5, 30.0)
             out[p, 11] = _log(contrast / (along + 1.0), 0.5, 30.0)
@@ -205,6 +227,11 @@ def judge(
             out[p, 13] = _log(pieces[p, 7] / <float> strokes, 0.01, 1.0)
             out[p, 14] = _log(pieces[p, 10] / total, 0.01, 1.0)
             out[p, 15] = _log(w / 3.0, 1.0, 4.0)
+            value = contrast
+            for side in range(2):
+                if beyonds[side] > 0 and beyond[side] < value * beyonds[side]:
+                    value = beyond[side] / beyonds[side]
+            out[p, 16] = _log(value / (0.5 * contrast), 0.1, 1.0)
 
 
 cdef inline float _between(const unsigned char *image, Py_ssize_t width, float u, float v) noexcept nogil:

@@ -162,7 +162,7 @@ def test_evidence_is_that_of_numpy(seed, masked):
     pieces[1, 1] = 4
     results = []
     for kernels in (_measure, measure_reference):
-        out = np.full((2, 16), 9.0, np.float32)
+        out = np.full((2, 17), 9.0, np.float32)
         kernels.judge(image, valid, path, pieces, 2, -1.0, 100, np.empty((900, 2), np.float32), out)
         results.append(out)
     assert results[0][0, 0] == 1.0

@@ -172,6 +172,30 @@ def test_one_edge_of_a_shadow_is_no_line():
     assert LineDetector(LineConfig("both", (12, 20))).detect(image) == []
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.08, 0.2])
+@pytest.mark.parametrize("gap", [14, 18, 22])
+def test_the_strip_between_a_joint_and_a_shadow_is_no_line(gap, tilt):
+    v, u = np.mgrid[0:H, 0:W]
+    image = np.full((H, W), 150.0)
+    image[u > 150 + gap + tilt * (v - H / 2)] *= 0.5
+    image[:, 146:150] = 90.0
+    image = cv2.GaussianBlur(image, (0, 0), 1.0) + np.random.default_rng(0).normal(0.0, 2.0, image.shape)
+    assert LineDetector(LineConfig("bright", (14, 28))).detect(image.astype(np.uint8)) == []
+
+
+def test_a_line_wider_than_asked_for_is_refused_to_half_a_pixel():
+    image = draw([[(150, 0), (150, 239)]], 26)
+    assert LineDetector(LineConfig("dark", (15, 25))).detect(image) == []
+    (line,) = LineDetector(LineConfig("dark", (15, 26))).detect(image)
+    assert line.width == pytest.approx(26.0, abs=0.4)
+
+
+def test_a_line_between_two_others_a_width_and_a_half_off_is_found():
+    image = draw([[(u, 0), (u, 239)] for u in (110, 150, 190)], 16)
+    lines = LineDetector(LineConfig("dark", (12, 21))).detect(image)
+    assert sorted(round(float(line.points[:, 0].mean())) for line in lines) == [110, 150, 190]
+
+
 def test_nothing_is_found_where_the_view_is_not_valid():
     image = draw([[(0, 120), (299, 120)]], 16)
     valid = np.ones((H, W), bool)

@@ -13,6 +13,7 @@ from .polyline import arc_length
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
+MOST_SLOPE = 0.08  # of the width along the line, that bends and tilted views explain
 OUT_OF_VIEW = 1.5  # widths that an end beyond the view counts for
 
 
@@ -30,7 +31,7 @@ def judge(
     """What speaks for each piece being a line: see `evidence.WITNESSES` for the columns of `out` from 1 on.
 
     Every quarter of a width the line is cut across: three pixels in it, and three to each side of it, half a width and
-    more from its border.
+    more from its border; and three more up to one and a quarter widths from it.
 
     Parameters
     ----------
@@ -41,27 +42,26 @@ def judge(
     sign : -1 for dark lines, +1 for bright ones.
     strokes : all that were found in the image.
     scratch : (3 M, 2) array; M limits the cuts of one piece.
-    out : (P, 16) array to fill. Column 0 is 1, or 0 if the piece is out of view or of the other polarity.
+    out : (P, 17) array to fill. Column 0 is 1, or 0 if the piece is out of view or of the other polarity.
     """
     total = float(pieces[:count, 10].sum())
     for p in range(count):
-        start, size, width, slope, spread, filled, passed, claimed, closed, ragged, length = (
-            float(x) for x in pieces[p]
-        )
+        start, size, width, slope, spread, _, _, claimed, closed, ragged, length = (float(x) for x in pieces[p])
         path = points[int(start) : int(start + size)].astype(np.float64)
         cut = _resampled(path, max(0.25 * width, 1.0), 5, len(scratch) // 3)
         n = len(cut)
         normal = _normals(cut, 1)
         half = 0.5 * np.maximum(width + slope * length * (np.linspace(0.0, 1.0, n) - 0.5), 0.5 * width)
         inside = np.column_stack([_at(image, valid, cut + (k * half)[:, None] * normal) for k in (-0.45, 0.0, 0.45)])
-        beside = []
+        beside: list[Floats] = []
+        far_off: list[Floats] = []
         for side in (-1.0, 1.0):
-            reach = half[:, None] + np.array([0.5, 0.75, 1.0]) * np.maximum(half, 4.0)[:, None]
-            greys = np.column_stack([_at(image, valid, cut + (side * r)[:, None] * normal) for r in reach.T])
-            seen = (greys >= 0.0).sum(axis=1)
-            beside.append(
-                np.where(seen > 0, np.where(greys >= 0.0, greys, 0.0).sum(axis=1) / np.maximum(seen, 1), -1.0)
-            )
+            for greys_of, halves in ((beside, (0.5, 0.75, 1.0)), (far_off, (1.5, 2.0, 2.5))):
+                reach = half[:, None] + np.array(halves) * np.maximum(half, 4.0)[:, None]
+                greys = np.column_stack([_at(image, valid, cut + (side * r)[:, None] * normal) for r in reach.T])
+                seen = (greys >= 0.0).sum(axis=1)
+                total_of = np.where(greys >= 0.0, greys, 0.0).sum(axis=1)
+                greys_of.append(np.where(seen > 0, total_of / np.maximum(seen, 1), -1.0))
         shown = (inside >= 0.0).all(axis=1) & (beside[0] >= 0.0) & (beside[1] >= 0.0)
         out[p] = 0.0
         if shown.sum() < 3:
@@ -77,6 +77,8 @@ def judge(
         tone = inside.mean(axis=1)
         left, right = sign * (tone - beside[0][shown]), sign * (tone - beside[1][shown])
         contrast = 0.5 * float(left.mean() + right.mean())
+        beyond_it = [sign * (tone - greys[shown])[greys[shown] >= 0.0] for greys in far_off]
+        farther = min([contrast] + [float(of.mean()) for of in beyond_it if len(of)])
         low = float(min(left.mean(), right.mean()))
         if contrast <= 1.0 or low <= 0.0:
             continue
@@ -93,13 +95,13 @@ def judge(
         out[p] = (
             1.0,
             _log(length / width + OUT_OF_VIEW * beyond, 0.5, 15.0),
-            filled / passed if passed > 0.0 else 1.0,
+            min(max(10.0 * (abs(slope) - MOST_SLOPE), 0.0), 2.0),
             _log(float(near.mean()) / (0.7 * contrast) if len(near) else 0.0, 0.3, 1.0),
             min(max(10.0 * spread / width, 0.1), 2.0),
             min(max(10.0 * ragged / width, 0.1), 2.0),
             _log(contrast / (scatter + 1.0), 0.2, 12.0),
             _log(contrast, 1.0, 60.0),
-            _log(low / contrast, 0.05, 1.0),
+            _log(low / (0.65 * contrast), 0.1, 1.0),
             float((np.minimum(left, right) > 0.4 * contrast).mean()),
             _log(contrast / (inner + 1.0), 0.5, 30.0),
             _log(contrast / (along + 1.0), 0.5, 30.0),
@@ -107,6 +109,7 @@ def judge(
             _log(claimed / strokes, 0.01, 1.0),
             _log(length / total, 0.01, 1.0),
             _log(width / 3.0, 1.0, 4.0),
+            _log(farther / (0.5 * contrast), 0.1, 1.0),
         )
 
 

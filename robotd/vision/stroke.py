@@ -61,6 +61,7 @@ PROMISING = 0.03  # confidence from which a piece is followed beyond its ends
 WIDTH_WEIGHT = 4.0  # 28 % of width weighs as much as half a width of distance
 TURN_WEIGHT = 0.9  # of the doubled angle
 CURVATURE_REACH = 3.0  # widths of line over which the curvature is fitted
+WIDTH_ERROR = 0.5  # px of the width measured last, where blur and noise are great
 WIDEST = 2.5  # share of the view's shorter side that a line of unknown width may take, as a divisor
 WORKING_WIDTH = 9.0  # px of the line after reduction, at least
 LARGE_VIEW = 150_000  # px; above it a line may also be halved to
@@ -170,7 +171,7 @@ class _Workspace:
             first=np.empty(MOST_CLUSTERS + 1, np.int32),
             axis=np.empty(MOST_CLUSTERS, np.int32),
             scratch=np.empty((8 * 4096, 2), np.float32),
-            evidence=np.empty((MOST_PIECES, 16), np.float32),
+            evidence=np.empty((MOST_PIECES, 17), np.float32),
             exact=np.empty((4096, 2)),
         )
 
@@ -266,8 +267,15 @@ class LineDetector:
                 continue
             for path, row, sure in self._likely(work, pieces, sign, strokes):
                 if sure >= self.config.min_confidence and level.low <= row[2] <= level.high:
-                    lines.append(_refined(work, path, row, gray, self._mask, 1.0 / level.scale, sign, sure))
+                    line = _refined(work, path, row, gray, self._mask, 1.0 / level.scale, sign, sure)
+                    if self._fits(line.width):
+                        lines.append(line)
         return lines
+
+    def _fits(self, width: float) -> bool:
+        """Whether a line measured at full resolution is as wide as was asked for."""
+        least, greatest = self.config.width_px or (0.0, math.inf)
+        return least - WIDTH_ERROR <= width <= greatest + WIDTH_ERROR
 
     def _edges(self, level: _Level, gray: Bytes, mask: Bytes | None) -> tuple[_Workspace, int, float]:
         """The thin edges of one scale, in the buffers: these, how many, and the mean threshold."""
