@@ -13,6 +13,7 @@ from robotd.records import CameraModel, Line, Pose, Transform
 from robotd.vision.line_icp import View, motion_between
 from robotd.vision.line_sight import to_robot
 from robotd.vision.line_tracker import LineTracker, PoseHistory, TrackerConfig
+from robotd.vision.polyline import arc_length
 from robotd.vision.stroke import LineConfig, LineDetector
 from robotd.vision.top_view import TopView
 
@@ -191,6 +192,21 @@ def test_a_sharp_corner_is_remembered_round_its_edge():
     drive(tracker, path, history, np.arange(0.0, 3.0, 1 / 30))
     assert distance_to(tracker.path, path).max() < 0.012
     assert tracker.path[-1, 1] > 0.2
+
+
+@pytest.mark.parametrize("turn", [math.radians(-64.0), math.radians(90.0), math.radians(120.0)])
+def test_a_corner_that_was_first_seen_up_to_the_far_border_of_its_tape_leaves_no_spike(turn):
+    corner, s = np.array([1.5, 0.0]), np.arange(0.0, 1.0, 0.01)[:, None]
+    one = np.column_stack([np.arange(-0.5, 1.5, 0.01), np.zeros(200)])
+    path = np.vstack([one, corner + s * [math.cos(turn), math.sin(turn)]])
+    too_long = np.vstack([one, corner + s[:5] * [1.0, 0.0]])
+    tracker, history = LineTracker(VIEW), straight_history(duration=8.0)
+    drive(tracker, too_long, history, np.arange(0.0, 3.0, 1 / 30))
+    drive(tracker, path, history, np.arange(3.0, 6.0, 1 / 30))
+    assert distance_to(tracker.path, path).max() < 0.02
+    feet = [int(np.hypot(*(path - end).T).argmin()) for end in (tracker.path[0], tracker.path[-1])]
+    assert feet[1] > 200  # round the corner
+    assert arc_length(tracker.path)[-1] == pytest.approx(0.01 * np.ptp(feet), abs=0.025)  # not out and back as well
 
 
 def test_a_slip_of_a_wheel_is_corrected_within_a_third_of_a_second():

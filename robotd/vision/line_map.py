@@ -120,15 +120,26 @@ class LineMap:
         self.missed = np.where(seen, 0, self.missed + (shown & ~seen))
         self.shown = self.shown + seen
 
-    def append(self, points: Floats, weight: float, join: float | None = None) -> bool:
+    def append(self, points: Floats, weight: float, join: float | None = None, leaves: float = math.inf) -> bool:
         """Prolong it by points at least half a spacing from its end, also round a sharp corner; whether it grew.
 
-        `join` is the longest gap for this once.
+        Parameters
+        ----------
+        points : (N, 2) array
+        weight : float
+            1 / variance of the points across the line.
+        join : float, optional
+            The longest gap for this once.
+        leaves : float
+            Arc length at which the points leave it. What is remembered beyond goes: a view that ended in a corner
+            showed the tape up to its outer border, and that would stay as a spike to drive round.
         """
-        away = np.hypot(*(points - self.path[-1]).T)
+        keep = self.lengths <= max(leaves, 0.0) + 1e-9
+        away = np.hypot(*(points - self.path[keep][-1]).T)
         far = np.flatnonzero(away >= 0.5 * self.spacing)
         if len(far) == 0 or away[far[0]] > (self._join if join is None else join) or len(points) - far[0] < 2:
             return False
+        self._keep(keep)
         added = resample(np.vstack([self.path[-1], points[int(far[0]) :]]), self.spacing)[1:]
         self.path = np.vstack([self.path, added])
         self.weights = np.concatenate([self.weights, np.full(len(added), weight)])

@@ -380,7 +380,8 @@ class LineTracker:
         self._map.merge(match, weight)
         last = int(np.flatnonzero(match.on)[-1])
         if grow and end - match.along[last] < 1.5 * self.config.spacing:
-            self._map.append(sight.points[last + 1 :], float(weight[match.on].min()))
+            weakest = float(weight[match.on].min())
+            self._map.append(sight.points[last + 1 :], weakest, leaves=float(match.along[last]))
 
     def _may_grow(self, found: Sequence[Sight]) -> bool:
         """Whether the memory's end is open: one that was seen is believed until several frames show more line."""
@@ -429,8 +430,7 @@ class LineTracker:
         here = line.foot(pose, config.behind + 0.6)
         branch = self._junctions.choose(line, found, here)
         if branch is not None:
-            line.cut(branch.s)
-            line.append(branch.points, 1.0 / config.point_sigma**2)
+            line.append(branch.points, 1.0 / config.point_sigma**2, leaves=branch.s)
         seen = np.flatnonzero(line.missed == 0)
         last = int(seen[-1]) if len(seen) else len(line) - 1
         if last < len(line) - 1:
