@@ -119,7 +119,11 @@ def test_the_cost_is_zero_on_a_period_and_limited_elsewhere():
 
 
 def lamps_of(*looks):
-    return [Lamp(np.array([[1.0, start, 0.003]]), light, width) for start, light, width in looks]
+    """Lights in a slanted row."""
+    return [
+        Lamp(np.array([[1.0, start, 0.003]]), peak, width, 100.0 + 60.0 * k, 100.0 + 40.0 * k)
+        for k, (start, peak, width) in enumerate(looks)
+    ]
 
 
 def test_a_dim_and_blurred_light_of_the_same_phase_is_a_reflection():
@@ -128,8 +132,24 @@ def test_a_dim_and_blurred_light_of_the_same_phase_is_a_reflection():
     assert max(probability[0], probability[2]) < 0.2
 
 
+def test_a_chance_match_far_off_is_no_reflection_and_one_straight_below_is():
+    looks = np.array([[1.0, 0.75, 0.006]]), np.array([[1.0, 0.744, 0.006]])
+
+    def doubt(u, v):
+        others = [Lamp(np.array([[1.0, start, 0.006]]), 60.0, 1.1, 300.0, 100.0) for start in (0.1, 0.4)]
+        lamps = [Lamp(looks[0], 94.0, 1.0, 300.0, 60.0), Lamp(looks[1], 5.0, 1.4, u, v), *others]
+        return reflected(lamps, 1.0)[1]
+
+    assert doubt(302.0, 140.0) > 0.7
+    assert doubt(30.0, 200.0) < 0.4
+
+
+def test_of_two_equal_lights_of_one_phase_neither_is_called_the_reflection():
+    assert max(reflected(lamps_of((0.3, 50.0, 1.1), (0.301, 50.0, 1.1)), 1.0)) < 0.5
+
+
 def test_without_a_fine_phase_nothing_is_called_a_reflection():
-    coarse = [Lamp(np.array([[1.0, 0.3, 0.03]]), light, 1.0) for light in (100.0, 20.0)]
+    coarse = [Lamp(np.array([[1.0, 0.3, 0.03]]), peak, 1.0, 100.0, row) for peak, row in ((100.0, 50.0), (20.0, 90.0))]
     assert max(reflected(coarse, 1.0)) == 0.0
     assert len(reflected([], 1.0)) == 0
 

@@ -78,7 +78,7 @@ class FlashConfig:
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
     steady_hz: tuple[float, ...] = (1.0, 2.0, 5.0, 8.0, 10.0)
     max_candidates: int = ranged(72, minimum=1, maximum=2000, doc="apertures examined at one decision")
-    max_reflection: float = ranged(0.65, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
+    max_reflection: float = ranged(0.5, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
 
     def min_score(self, shape: tuple[int, int]) -> float:
         """Log-likelihood ratio from which a light is accepted in images of this shape (H, W)."""
@@ -187,7 +187,7 @@ class FlashDetector:
         if self._block_frames >= _FEW or (self._block_frames and not self.tracks):
             self._decide(self._times[-1][1])
         seen = [(track, spot) for track in self.tracks if (spot := self.spot(track)) is not None]
-        lamps = [Lamp(np.array(track.looks), spot.peak * spot.width**2, spot.width) for track, spot in seen]
+        lamps = [Lamp(np.array(track.looks), spot.peak, spot.width, spot.u, spot.v) for track, spot in seen]
         config = self.config
         found = []
         for (track, spot), reflection in zip(seen, reflected(lamps, config.pattern.period), strict=True):
