@@ -58,6 +58,8 @@ class Film:
         fine = (fine - fine.min()) / np.ptp(fine)
         coarse = cv2.resize(self.rng.random((height // 40, width // 40)), self.size, interpolation=cv2.INTER_CUBIC)
         self.floor = np.clip(0.06 + 0.3 * fine + 0.2 * coarse, 0.01, 1.0).astype(np.float32)
+        # one field of noise, seen at another place in every frame
+        self.grain = self.noise * self.rng.standard_normal((height + 64, width + 64, 3), np.float32)
         self.phase = self.rng.uniform(0.0, 1.0)
 
     def place(self, beacon, t):
@@ -76,6 +78,10 @@ class Film:
             return whole * 0.5 / hz + min(rest, 0.5 / hz)
 
         return (integral(t + self.exposure) - integral(t)) / self.exposure
+
+    def grey(self, linear):
+        """Grey levels of linear light, white 1."""
+        return 255.0 * cv2.pow(np.clip(linear, 0.0, 1.0), 1.0 / self.gamma)
 
     def frames(self, seconds):
         """Stamp and picture of each frame."""
@@ -96,21 +102,25 @@ class Film:
 
         disc(middle, 1.0 * self.spacing, 0.05)
         disc(middle + 3.0, 0.3 * self.spacing, 0.2)
-        if self.walker:
+        open_view = np.ones_like(linear)
+        if self.walker:  # higher than the robot: hides its lights
             at = (int(16 * (30 + 90 * (t % 3.0))), int(16 * (60 + 40 * np.sin(t))))
-            cv2.ellipse(linear, at, (16 * 18, 16 * 45), 10, 0, 360, 0.3 + 0.2 * np.sin(6 * t), -1, cv2.LINE_AA, 4)
-        picture = np.repeat(linear[:, :, None], 3, axis=2)
-        v, u = np.mgrid[0 : self.size[1], 0 : self.size[0]]
+            cv2.ellipse(open_view, at, (16 * 18, 16 * 45), 10, 0, 360, 0.0, -1, cv2.LINE_AA, 4)
+            linear = linear * open_view + np.float32(0.3 + 0.2 * np.sin(6 * t)) * (1.0 - open_view)
+        out = cv2.merge([self.grey(linear)] * 3)
         for (name, hz), is_lit in zip(zip(RATES, self.rates, strict=True), self.lit, strict=True):
             at = self.place(name, t + 0.5 * self.exposure)
             begun = t + self.row_time * at[1]
             at = self.place(name, begun + 0.5 * self.exposure)
-            box = np.s_[int(at[1]) - 9 : int(at[1]) + 10, int(at[0]) - 9 : int(at[0]) + 10]
-            spot = np.exp(-0.5 * ((u[box] - at[0]) ** 2 + (v[box] - at[1]) ** 2) / self.blur**2)
-            lightness = self.light * self.share(hz, begun) * is_lit
-            picture[box] += (lightness * spot)[:, :, None] * np.array(self.colour) / 255.0
-        out = 255.0 * np.clip(picture, 0.0, 1.0) ** (1.0 / self.gamma)
-        out = np.clip(np.rint(out + self.rng.normal(0.0, self.noise, out.shape)), 0, 255).astype(np.uint8)
+            left, top = int(at[0]) - 9, int(at[1]) - 9
+            box = np.s_[top : top + 19, left : left + 19]
+            v, u = np.ogrid[top : top + 19, left : left + 19]
+            spot = np.exp(-0.5 * ((u - at[0]) ** 2 + (v - at[1]) ** 2) / self.blur**2)
+            light = (self.light * self.share(hz, begun) * is_lit * spot * open_view[box])[:, :, None]
+            out[box] = self.grey((linear[box][:, :, None] + light * np.array(self.colour) / 255.0).astype(np.float32))
+        top, left = self.rng.integers(0, 64, 2)
+        out += self.grain[top : top + out.shape[0], left : left + out.shape[1]]
+        out = np.clip(np.rint(out, out=out), 0, 255, out=out).astype(np.uint8)
         if self.quality is not None:
             out = cv2.imdecode(cv2.imencode(".jpg", out, (cv2.IMWRITE_JPEG_QUALITY, self.quality))[1], 1)
         if self.channel == "red":

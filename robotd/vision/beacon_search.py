@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Floats
+from .beacon_track import undisturbed
 from .beacon_wave import Lock, Wave, lock
 
 Image = NDArray[np.uint8]
@@ -128,8 +129,9 @@ def _tried(
     if not (reach <= u < width - reach and reach <= v < height - reach):
         return None
     crops = np.stack([frame[v - reach : v + reach + 1, u - reach : u + reach + 1] for frame in frames])
-    series = aperture_series(crops.astype(np.float32), reach, reach)
-    begun = t + row_time * v
+    kept = undisturbed(crops)
+    series = aperture_series(crops[kept].astype(np.float32), reach, reach)
+    begun = t[kept] + row_time * v
     starts = np.arange(0.0, 1.0 / wave.hz, STARTS_S)
     found = lock(series, begun, wave, starts)
     if found.log_p > log_level or found.amplitude <= 0.0:

@@ -25,21 +25,29 @@ Path = Callable[[Floats], Floats]
 
 REACH = 7  # px, half the side of a cut
 WIDE = 13  # where the prediction is poor
+AROUND = 5  # px from the beacon: what is beyond is not its light
+DISTURBED = 3.0  # as much change around a beacon as usual is somebody who walks there
 WHITE = 252  # grey levels, from which a pixel may be clipped
 CUTS = 3  # times that cuts are made along a better path
 SETTLED_PX = 0.3  # between what was cut and what was fitted: interpolation no longer matters
 STEPS = 8
 LEAST_FRAMES = 8
 LEAST_LIT = 2.0  # frames' worth of light, and of darkness
+FIRST_ERROR, LEAST_ERROR = 0.06, 0.02  # of the peak: by how much a compressed light differs from a spot
+ERROR_PX = 4.0  # they are much alike over so many pixels (chroma: two, smoothed), so that fewer of them average out
 WIDTHS = (0.45, 4.0)  # px: narrower is a hot pixel, wider is no LED
 
 
 @dataclass(frozen=True, slots=True)
 class Cuts:
-    """(N, K, K) pieces of linear light along a path, and which pixels (K, K) were never clipped."""
+    """(N, K, K) pieces of linear light along a path, and which of their pixels were not clipped."""
 
     light: NDArray[np.float32]
     valid: NDArray[np.bool_]
+
+    def where(self, kept: NDArray[np.bool_]) -> Cuts:
+        """The cuts of some of the frames, by an (N,) mask."""
+        return Cuts(self.light[kept], self.valid[kept])
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +117,19 @@ def cut(frames: Sequence[Image], path: Floats, table: NDArray[np.float32], reach
     x, y = part[:, 0, None, None], part[:, 1, None, None]
     light = (1.0 - x) * light[:, :, :-1] + x * light[:, :, 1:]
     light = (1.0 - y) * light[:, :-1] + y * light[:, 1:]
-    white = np.asarray((raw >= WHITE).any(axis=0))
-    return Cuts(light, ~(white[:-1, :-1] | white[1:, :-1] | white[:-1, 1:] | white[1:, 1:]))
+    white = raw >= WHITE
+    return Cuts(light, ~(white[:, :-1, :-1] | white[:, 1:, :-1] | white[:, :-1, 1:] | white[:, 1:, 1:]))
+
+
+def undisturbed(light: NDArray[np.float32] | Image) -> NDArray[np.bool_]:
+    """(N,) which of (N, K, K) cuts show the surroundings that most of them show: nobody walks over the beacon.
+
+    All of them, if too few would be left to say what is usual.
+    """
+    around = light[:, _away(light.shape[1]) >= AROUND]
+    change = np.abs(around - np.median(around, axis=0)).mean(axis=1)
+    kept = np.asarray(change < DISTURBED * np.median(change) + 1.0)
+    return kept if np.count_nonzero(kept) >= max(LEAST_FRAMES, 0.5 * len(kept)) else np.ones(len(kept), np.bool_)
 
 
 def fit_beacon(
@@ -161,16 +180,18 @@ def fit_beacon(
     middle = float(lit.mean())
     correction = np.zeros((3, 2))
     found: _Fit | None = None
+    tau = lit - middle
     for _ in range(CUTS):
-        tau = lit - middle
         cuts = cut(frames, places + np.stack([tau**0, tau, tau**2], axis=1) @ correction, table, reach)
         if cuts is None:
             return None
-        locked = lock(_series(cuts.light), begun, wave, starts)
-        s = wave(begun - locked.start)
+        kept = undisturbed(cuts.light)
+        cuts = cuts.where(kept)
+        locked = lock(_series(cuts.light), begun[kept], wave, starts)
+        s = wave(begun[kept] - locked.start)
         if locked.amplitude <= 0.0 or not LEAST_LIT <= s.sum() <= len(s) - LEAST_LIT:
             return None
-        found = _fit_cuts(cuts, s, tau, order, found)
+        found = _fit_cuts(cuts, s, tau[kept], order, found)
         if found is None:
             return None
         moved = np.stack([tau**0, tau, tau**2], axis=1) @ found.miss
@@ -201,7 +222,7 @@ def fit_beacon(
         peak=found.peak,
         width=found.width,
         clipped=not bool(cuts.valid.all()),
-        frames=len(frames),
+        frames=len(cuts.light),
     )
 
 
@@ -231,7 +252,12 @@ class _Fit:
 
 
 def _fit_cuts(cuts: Cuts, s: Floats, tau: Floats, order: int, before: _Fit | None) -> _Fit | None:
-    """Gauss-Newton on peak, log width and the polynomial; background projected out."""
+    """Fit peak, log width and the polynomial; background projected out.
+
+    However long one looks, a compressed light is no Gaussian spot: what JPEG makes of it, in chroma above all, stays
+    the same as long as it stands. That error is the same share of the light everywhere, so that it is added to the
+    noise of every pixel; else the quietest pixels, which are at the spot's foot and blocky, would place it.
+    """
     n, size, _ = cuts.light.shape
     reach = (size - 1) // 2
     back = np.stack([np.ones(n), tau], axis=1)
@@ -246,21 +272,21 @@ def _fit_cuts(cuts: Cuts, s: Floats, tau: Floats, order: int, before: _Fit | Non
     image = (lit @ y / energy).reshape(size, size)
     noise = np.maximum((y**2).sum(axis=0) - energy * image.ravel() ** 2, 0.0) / max(1, n - 3)
     noise = np.maximum(noise, 0.25 * np.median(noise)) + 1e-3
+    valid = np.asarray(cuts.valid.all(axis=0), np.bool_)
     if before is None:
-        spot = fit_spot(image, (noise / energy).reshape(size, size), cuts.valid)
+        spot = fit_spot(image, (noise / energy).reshape(size, size), valid)
         if spot is None or spot.peak <= 0.0:
             return None
         start = np.array([spot.peak, np.log(spot.width), spot.u - reach, spot.v - reach])
     else:
         start = np.array([before.peak, np.log(before.width), 0.0, 0.0])
-    weight = np.sqrt(np.where(cuts.valid.ravel(), 1.0 / noise, 0.0))
     powers = np.stack([tau**k for k in range(order + 1)])
     parameters = np.zeros(2 + 2 * (order + 1))
     parameters[:2], parameters[2], parameters[3 + order] = start[:2], start[2], start[3]
     pixels = np.arange(-reach, reach + 1, dtype=np.float64)
 
     def model(values: Floats) -> tuple[Floats, Floats]:
-        """Residuals (N K^2,) and Jacobian (N K^2, P), whitened."""
+        """Residuals (N, K^2) and Jacobian (P, N, K^2)."""
         peak, width = values[0], float(np.exp(values[1]))
         u, v = values[2 : 3 + order] @ powers, values[3 + order :] @ powers
         du, dv = pixels[None, None, :] - u[:, None, None], pixels[None, :, None] - v[:, None, None]
@@ -268,20 +294,48 @@ def _fit_cuts(cuts: Cuts, s: Floats, tau: Floats, order: int, before: _Fit | Non
         by_u, by_v = peak * bell * du / width**2, peak * bell * dv / width**2
         columns = [bell, peak * bell * (du**2 + dv**2) / width**2]
         columns += [by_u * power[:, None, None] for power in powers] + [by_v * power[:, None, None] for power in powers]
-        flat = [projected(column.reshape(n, -1)) * weight for column in columns]
-        return (y * weight - peak * flat[0]).ravel(), np.stack([column.ravel() for column in flat], axis=1)
+        flat = np.stack([projected(column.reshape(n, -1)) for column in columns])
+        return y - peak * flat[0], flat
 
+    error = FIRST_ERROR * parameters[0]
+    for last in (False, True):
+        weight = np.where(valid.ravel(), 1.0 / np.sqrt(noise + energy * error**2), 0.0)
+        parameters, residual, jacobian = _descend(parameters, model, weight)
+        if not last:  # how far the image of the light is from a spot, beyond what noise explains
+            beyond = ((lit @ residual / energy) ** 2 - noise / energy)[valid.ravel()].mean()
+            error = max(LEAST_ERROR * parameters[0], ERROR_PX * np.sqrt(max(float(beyond), 0.0)))
+    jacobian = (jacobian * weight).reshape(len(parameters), -1)
+    cost = float(((residual * weight) ** 2).sum())
+    miss = np.zeros((3, 2))
+    miss[: order + 1, 0], miss[: order + 1, 1] = parameters[2 : 3 + order], parameters[3 + order :]
+    if parameters[0] <= 0.0 or float(np.abs(powers.T @ miss[: order + 1]).max()) > reach:
+        return None
+    spread = np.linalg.pinv(jacobian @ jacobian.T)[2:, 2:] * max(1.0, cost / max(1, residual.size - size * size))
+    covariance = np.zeros((6, 6))
+    kept = [k for k in range(6) if k % 3 <= order]
+    covariance[np.ix_(kept, kept)] = spread
+    best = 0.0 if order == 0 else -float(spread[0, 1] / spread[1, 1])
+    return _Fit(miss, covariance, best, float(parameters[0]), float(np.exp(parameters[1])))
+
+
+def _descend(
+    parameters: Floats, model: Callable[[Floats], tuple[Floats, Floats]], weight: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Levenberg-Marquardt from a first guess: parameters, residuals and Jacobian, these two not weighted."""
     damping = 1e-3
     residual, jacobian = model(parameters)
-    cost = float(residual @ residual)
+    cost = float(((residual * weight) ** 2).sum())
     for _ in range(STEPS):
-        normal = jacobian.T @ jacobian
-        step = np.linalg.solve(normal + np.diag(damping * np.diag(normal) + 1e-12), jacobian.T @ residual)
+        weighted = (jacobian * weight).reshape(len(parameters), -1)
+        normal = weighted @ weighted.T
+        step = np.linalg.solve(
+            normal + np.diag(damping * np.diag(normal) + 1e-12), weighted @ (residual * weight).ravel()
+        )
         step[1] = np.clip(step[1], -0.4, 0.4)
         trial = parameters + step
         trial[1] = np.clip(trial[1], *np.log(WIDTHS))
         new_residual, new_jacobian = model(trial)
-        new_cost = float(new_residual @ new_residual)
+        new_cost = float(((new_residual * weight) ** 2).sum())
         if new_cost <= cost:
             settled = cost - new_cost < 1e-4 * cost / residual.size + 1e-9
             parameters, residual, jacobian, cost = trial, new_residual, new_jacobian, new_cost
@@ -290,23 +344,19 @@ def _fit_cuts(cuts: Cuts, s: Floats, tau: Floats, order: int, before: _Fit | Non
                 break
         else:
             damping *= 10.0
-    miss = np.zeros((3, 2))
-    miss[: order + 1, 0], miss[: order + 1, 1] = parameters[2 : 3 + order], parameters[3 + order :]
-    if parameters[0] <= 0.0 or float(np.abs(powers.T @ miss[: order + 1]).max()) > reach:
-        return None
-    spread = np.linalg.pinv(jacobian.T @ jacobian)[2:, 2:] * max(1.0, cost / max(1, residual.size - size * size))
-    covariance = np.zeros((6, 6))
-    kept = [k for k in range(6) if k % 3 <= order]
-    covariance[np.ix_(kept, kept)] = spread
-    best = 0.0 if order == 0 else -float(spread[0, 1] / spread[1, 1])
-    return _Fit(miss, covariance, best, float(parameters[0]), float(np.exp(parameters[1])))
+    return parameters, residual, jacobian
 
 
 def _series(light: NDArray[np.float32]) -> Floats:
     """(N,) light in the middle of the cuts, less that around it."""
     size = light.shape[1]
     reach = (size - 1) // 2
-    yy, xx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    far = np.maximum(np.abs(yy), np.abs(xx))
+    far = _away(size)
     inner, outer = far <= reach - 5, far >= reach - 1
     return np.asarray(light[:, inner].mean(axis=1) - np.median(light[:, outer], axis=1), np.float64)
+
+
+def _away(size: int) -> NDArray[np.int64]:
+    """(size, size) steps of a king from the middle of a square."""
+    steps = np.abs(np.arange(size) - (size - 1) // 2)
+    return np.maximum(steps[:, None], steps[None, :])

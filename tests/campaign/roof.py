@@ -42,9 +42,8 @@ def test_standing(channel):
         found += list(last.values())
         missing += 2 - len(last)
     print(f"\nstanding, {channel}: {len(found)} beacons, {missing} not found in 5 s, {rms(found):.3f} px rms")
-    if channel == "gray":
-        assert missing <= 0.1 * 2 * len(SEEDS)
-        assert rms(found) <= STATIC_PX
+    assert missing <= 0.1 * 2 * len(SEEDS)
+    assert rms(found) <= STATIC_PX
 
 
 def test_moving():
