@@ -179,11 +179,11 @@ def test_a_survey_that_cannot_be_solved_ends_with_code_1(files, capsys, monkeypa
 
 def test_serve_hands_address_folder_and_token_to_the_server(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr("robotd.server.app.serve", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr("robotd.server.app.serve", lambda *arguments, **limits: calls.append((*arguments, limits)))
     (tmp_path / "token").write_text("secret\n")
     options = ["--host", "::1", "--port", "0", "--data", tmp_path / "data", "--token-file", tmp_path / "token"]
-    assert run("serve", *options) == 0
-    assert calls == [("::1", 0, tmp_path / "data", "secret")]
+    assert run("serve", *options, "--recording-limit-gb", "2") == 0
+    assert calls == [("::1", 0, tmp_path / "data", "secret", {"recording_limit": 2_000_000_000})]
 
 
 @pytest.mark.parametrize("content", [b"", b"\n", b"two words\n", b"\xff\xfe"])
