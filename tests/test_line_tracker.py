@@ -290,6 +290,18 @@ def test_a_fork_is_taken_as_the_rule_says(rule, heading, direction):
     assert math.degrees(math.atan2(last[1], last[0])) == pytest.approx(direction, abs=8.0)
 
 
+@pytest.mark.parametrize(
+    ("rule", "sides", "direction"),
+    [("left", (45.0, -45.0), 45.0), ("right", (35.0, -60.0), -60.0), ("straight", (60.0, -60.0), 0.0)],
+)
+def test_the_side_ways_of_a_trident_are_two_even_if_they_are_seen_as_one_line(rule, sides, direction):
+    tracker = LineTracker(VIEW, config=TrackerConfig(fork=rule))
+    lines = many(np.vstack([TRUNK, bent(0.0)]), np.vstack([bent(sides[0])[::-1], bent(sides[1])]))
+    drive(tracker, None, straight_history(duration=6.0), np.arange(0.0, 4.0, 1 / 30), lines=lines)
+    last = tracker.path[-1] - [1.2, 0.0]
+    assert math.degrees(math.atan2(last[1], last[0])) == pytest.approx(direction, abs=8.0)
+
+
 def test_a_crossing_line_does_not_lead_astray():
     tracker = LineTracker(VIEW)
     across = np.column_stack([np.full(120, 1.2), np.linspace(-0.6, 0.6, 120)])

@@ -20,6 +20,7 @@ Rule = Literal["straight", "left", "right", "heading"]
 REACH = 0.20  # m of a branch that say where it goes
 LEAST = 0.14  # m of a branch that are worth looking at
 PASSING = 0.10  # m from the line's middle to where a branch may begin: strokes end before a junction
+LEAVES = 0.015  # m from the line's middle at which a branch leaves it
 PARALLEL = math.radians(20.0)  # branches that differ by less are one line
 BACK = math.radians(135.0)  # nobody turns by more at a junction
 STRAIGHT_ON = math.radians(37.0)  # across a gap
@@ -134,7 +135,9 @@ class Junctions:
         found = nearest(sight.points, line.path, 0.05, lengths)
         on = np.flatnonzero(found.on)
         if len(on) >= 3:
-            first, s = int(on[-1]) + 1, float(found.along[on[-1]])
+            middle = on[np.abs(found.offset[on]) < LEAVES]
+            last = int((middle if len(middle) else on)[-1])
+            first, s = last + 1, float(found.along[last])
         else:
             first = int(found.gap.argmin())
             if found.gap[first] > PASSING:

@@ -105,6 +105,9 @@ class LineMap:
         order = np.argsort(found.along[on], kind="stable")
         place, offset = found.along[on][order], found.offset[on][order]
         covered = (lengths >= place[0] - 0.5 * self.spacing) & (lengths <= place[-1] + 0.5 * self.spacing)
+        covered &= self.missed >= 0  # once a frame: near a junction several sights pass, the fullest is merged first
+        if not covered.any():
+            return
         wanted = lengths[covered]
         seen = np.interp(wanted, place, weight[on][order])
         gain = seen / (self.weights[covered] + seen)
