@@ -134,7 +134,7 @@ class FlashDetector:
         self._shifts = np.zeros((_RING, 2))
         self._shift_sum = np.zeros(2)  # places are given where they are in the mean picture
         self._shake = Shake(_BEFORE)
-        self._blocks: deque[tuple[int, NDArray[np.int16], NDArray[np.int16]]] = deque()
+        self._blocks: deque[tuple[int, NDArray[np.int16], np.int16]] = deque()  # frames, sums, lower limit
         self._count = 0
         self._block_frames = 0
         self._due = -np.inf
@@ -317,16 +317,16 @@ class FlashDetector:
     def _decide(self, t: float) -> None:
         # because who passes by weighs more in one block than a label in all others
         usual = float(np.median(np.abs(self._total[1::4, 1::4]))) + 1.0
-        clipped = np.clip(self._total, np.int16(-min(_LOW * usual, _HIGH)), np.int16(_HIGH))
-        self._blocks.append((self._block_frames, self._total, clipped))
+        low = np.int16(-min(_LOW * usual, _HIGH))
+        self._blocks.append((self._block_frames, self._total, low))
         self._window += self._total
-        self._clipped += clipped
+        self._clipped += np.clip(self._total, low, np.int16(_HIGH))
         self._total = np.zeros_like(self._total)
         self._block_frames = 0
         while sum(block[0] for block in self._blocks) * self._pace() > self._window_s() + self.config.decision_s:
-            _, gone, clipped = self._blocks.popleft()
+            _, gone, low = self._blocks.popleft()
             self._window -= gone
-            self._clipped -= clipped
+            self._clipped -= np.clip(gone, low, np.int16(_HIGH))
         if t - self._times[0][1] < 1.4 * self.config.pattern.period:
             return
         rows, columns = self._candidates()
