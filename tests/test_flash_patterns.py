@@ -9,6 +9,7 @@ from robotd.bind import bind
 from robotd.errors import InputError
 from robotd.vision.blink import FlashConfig, FlashDetector, FlashPattern
 from robotd.vision.learn_pattern import learn_pattern, learn_trace
+from robotd.vision.matching import Matcher
 from robotd.vision.mirror import Lamp, reflected
 from robotd.vision.shake import Shake, kernels
 from robotd.vision.thesis_blink import ThesisFlashConfig, ThesisFlashDetector, cost, periods_of
@@ -56,6 +57,19 @@ def test_the_dark_before_and_after_the_flashes_does_not_matter():
     assert learnt.pattern.period == pytest.approx(1.0, abs=0.01)
     assert len(learnt.pattern.on) == 3
     assert 5 <= learnt.cycles <= 7
+
+
+@pytest.mark.parametrize("pattern", PATTERNS[:4])
+def test_two_seconds_hold_enough_of_a_pattern_wherever_it_starts(pattern):
+    times = 0.004 + np.arange(60) / 30.0
+    starts = np.arange(0.0, pattern.period, 0.02)
+    light = np.array([pattern.coverage((times - start) % pattern.period, 0.01, 2) for start in starts])
+    light += 0.05 * np.random.default_rng(0).normal(size=light.shape)
+    found = Matcher(pattern, 0.01, (1.0, 2.0, 5.0, 10.0)).match(
+        times, light.astype(np.float32), np.full(light.shape, 30.0, np.float32), np.zeros((len(times), 2))
+    )
+    assert found.regular.all()
+    assert found.score.min() > 25.0
 
 
 def test_what_was_learnt_is_a_setting():

@@ -28,6 +28,7 @@ _LEAST = 0.01  # energy per frame below which a pattern hardly touches the windo
 _HIDDEN = 0.02  # relative change of the light around a place that says somebody stands before it,
 _SPREADS = 5.0  # beyond so many of its usual spreads
 _OUTLIER = 4.5  # spreads of the residual
+_ENOUGH = 0.3  # of a period's energy that must be within the window, to count by itself
 _MOST_OUTLIERS = 0.12  # of the frames that count: with more, it is not the pattern that is there
 
 
@@ -227,16 +228,24 @@ class Matcher:
     def _is_regular(
         self, projection: Singles, squares: Singles, start: Indices, periods: Indices, light: Singles
     ) -> NDArray[np.bool_]:
-        """Two periods or more must each carry their share: one burst of clutter is no pattern."""
+        """Two periods or more must each carry their share: one burst of clutter is no pattern.
+
+        Periods that the window cuts short count together, because two seconds may hold no two whole ones.
+        """
         rows = np.arange(len(start))
-        enough = 0.3 * squares.max(axis=1)
+        enough = _ENOUGH * squares.max(axis=1)
         carrying, missing = np.zeros(len(start), int), np.zeros(len(start), int)
+        product, energy = np.zeros(len(start)), np.zeros(len(start))  # of all that are too short to count alone
         for k in range(int(periods.max(initial=0))):
             index = np.minimum(start + k * self._step, squares.shape[1] - 1)
             counted = (k < periods) & (squares[rows, index] >= enough)
             share = projection[rows, index] / np.maximum(squares[rows, index], 1e-6)
             carrying += counted & (share >= 0.4 * light)
             missing += counted & (share < 0.2 * light)
+            short = (k < periods) & ~counted
+            product += np.where(short, projection[rows, index], 0.0)
+            energy += np.where(short, squares[rows, index], 0.0)
+        carrying += (energy >= enough) & (product >= 0.4 * light * energy)
         return np.asarray((carrying >= 2) & (missing == 0))
 
 
