@@ -24,6 +24,7 @@ check: $(DEV)
 	cp -rs "$(CURDIR)/robotd" build/types/robotd && ln -s "$(CURDIR)/drivers" build/types/robotd/drivers
 	$(BIN)/mypy build/types/robotd
 	$(BIN)/robotd check -c etc/robotd.toml
+	$(BIN)/python -m tests.units
 
 bench: $(READY)
 	$(BIN)/python -m tests.bench

@@ -1,11 +1,11 @@
 """What is installed beside the package: units, users, udev rules."""
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.units import check
 
 ROOT = Path(__file__).parent.parent
 SYSTEMD = ROOT / "systemd"
@@ -17,34 +17,20 @@ def settings(unit):
     return [line for line in lines if line and not line.startswith("#")]
 
 
-@pytest.fixture
-def installed(tmp_path):
-    """The units with an ExecStart that exists here."""
-    for unit in UNITS:
-        text = (SYSTEMD / unit).read_text().replace("/opt/robotd/bin/", f"{Path(sys.executable).parent}/")
-        (tmp_path / unit).write_text(text)
-    return tmp_path
-
-
-needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed here")
-
-
-@needs_systemd
-@pytest.mark.parametrize("unit", UNITS)
-def test_systemd_finds_nothing_to_remark(installed, unit):
-    done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", str(installed / unit)], capture_output=True, text=True, check=False
-    )
-    assert [line for line in (done.stdout + done.stderr).splitlines() if "robotd" in line] == []
-    assert done.returncode == 0
-
-
-@needs_systemd
-@pytest.mark.parametrize("unit", UNITS)
-def test_the_exposure_is_low(installed, unit):
-    command = ["systemd-analyze", "security", "--offline=yes", "--threshold=15", str(installed / unit)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed here")
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("TimeoutStopSec=", "TimeoutStopSex=", "'TimeoutStopSex'"),
+        ("/opt/robotd/bin/robotd run", "/opt/robotd/bin/robott run", "robott"),
+        ("RestrictNamespaces=yes\nRestrictRealtime=yes\n", "", "exposure level"),
+        ("Type=notify", "Type=notifies", "Failed to parse service type"),
+    ],
+)
+def test_make_check_finds_what_systemd_only_warns_of_and_what_opens_a_unit(tmp_path, old, new, words):
+    unit = tmp_path / "robotd.service"
+    unit.write_text((SYSTEMD / unit.name).read_text().replace(old, new))
+    assert words in "\n".join(check(unit))
 
 
 def test_the_guardian_is_the_last_to_die_and_comes_back_for_ever():
