@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import shutil
 import tomllib
 from collections import Counter
@@ -25,6 +26,8 @@ from .safety import SafetyLimits
 from .toml_edit import assignments, replace_element, replace_table, toml
 
 T = TypeVar("T")
+
+_FINGERPRINT = re.compile("[0-9a-f]{64}")  # of SHA-256
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +99,31 @@ class MissionConfig:
 
 @dataclass(frozen=True, slots=True)
 class UploadConfig:
-    """[upload]"""
+    """[upload]
+
+    The server's certificate must be valid for the host in `url` and be signed by the system's authorities, or by those
+    of `ca_file`; with `pins` (SHA-256 fingerprints) it must also be one of these.
+    """
 
     url: str | None = None
     token_file: Path | None = None
     token_credential: str | None = None
+    ca_file: Path | None = None
+    pins: tuple[str, ...] = ()
     retry_s: float = ranged(5.0, minimum=0.1, maximum=3600.0)
     timeout_s: float = ranged(30.0, minimum=0.1, maximum=600.0)
+
+    def __post_init__(self) -> None:
+        pins = tuple(pin.replace(":", "").lower() for pin in self.pins)
+        for k, pin in enumerate(pins):
+            if not _FINGERPRINT.fullmatch(pin):
+                raise ValueError(
+                    f"pins[{k}] = '{self.pins[k]}'; expected 64 hexadecimal digits, as from "
+                    "openssl x509 -in server.pem -noout -fingerprint -sha256"
+                )
+        object.__setattr__(self, "pins", pins)
+        if (self.ca_file is not None or pins) and not (self.url or "").startswith("https:"):
+            raise ValueError("ca_file, pins: there is no certificate with http; expected https in url")
 
 
 @dataclass(frozen=True, slots=True)

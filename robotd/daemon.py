@@ -37,6 +37,7 @@ from .secret_file import read_credential, read_secret
 from .serial_log import LoggedHardware, SerialLog
 from .supervisor import Supervisor
 from .upload import Uploader
+from .web import WebServer
 
 log = logging.getLogger("robotd")
 
@@ -396,17 +397,19 @@ class Daemon:
         elif upload.token_credential is not None:
             token = read_credential(upload.token_credential, f"{self.assembly.path} upload.token_credential")
 
+        ca_file = None if upload.ca_file is None else self.assembly.path.parent / upload.ca_file
+        server = WebServer(upload.url, token, ca_file=ca_file, pins=upload.pins)
+
         def report(text: str, level: Any = "info") -> None:
             self.assembly.bus.events.publish(Event(now(), "upload", level, text))
 
-        return Uploader(self.journal, upload.url, token, upload.retry_s, upload.timeout_s, report)
+        return Uploader(self.journal, server, upload.retry_s, upload.timeout_s, report)
 
     def _upload_recordings(self, uploader: Uploader) -> RecordingUploader:
         """Sends finished recordings to where the stops go."""
         recordings = RecordingUploader(
             self.recordings.config.directory,
-            uploader.url,
-            uploader.token,
+            uploader.server,
             retry_s=uploader.retry_s,
             timeout_s=uploader.timeout_s,
             delete=self.recordings.config.delete_uploaded,

@@ -7,14 +7,12 @@ import importlib.util
 import json
 import os
 import socket
-import ssl
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from .config import Calibration, Config, load_calibration
 from .daemon import Plan, read_config
@@ -30,10 +28,13 @@ from .doctor_checks import (
     check_serial,
     check_token,
 )
-from .errors import ConfigError
+from .errors import ConfigError, InputError, UploadError
 from .hardware import CameraMode
+from .web import WebServer
 
 NETWORK_S = 8.0
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+ANSWERS = 16 << 20  # bytes of the longest list of surveys
 TOGETHER_S = 60.0
 
 
@@ -80,7 +81,7 @@ def examine(
     yield from check_power(root)
     token_file = None if config.upload.token_file is None else path.parent / config.upload.token_file
     yield from check_token(token_file, f"{path} upload.token_file", accounts)
-    yield from check_server(config, token_file)
+    yield from check_server(config, path.parent)
     yield from check_together(control or path.parent / config.robot.control, 0.0 if is_quick else TOGETHER_S)
 
 
@@ -108,45 +109,48 @@ def _look(device: str) -> tuple[float, tuple[str, ...]]:
         camera.node.close()
 
 
-def check_server(config: Config, token_file: Path | None) -> Iterator[Finding]:
-    """Whether the server is reachable, and takes our token."""
-    url = config.upload.url
+def check_server(config: Config, folder: Path) -> Iterator[Finding]:
+    """Whether the server is reachable, is the one that is meant, and takes our token; paths are under `folder`."""
+    upload = config.upload
+    url = upload.url
     if url is None:
         yield Finding("note", "server", "none is configured: stops stay on the robot", "set [upload] url")
         return
+    token_file = None if upload.token_file is None else folder / upload.token_file
+    is_ours = upload.token_credential is None and (token_file is None or os.access(token_file, os.R_OK))
     try:
-        _get(f"{url.rstrip('/')}/healthz", None)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "reason", error)
-        mend = (
-            "check the server's certificate, or the robot's clock"
-            if isinstance(reason, ssl.SSLError)
-            else ("check the address, the network, and that robotd-solver serve runs there")
+        token = token_file.read_text().strip() if token_file is not None and is_ours else None
+        server = WebServer(url, token, ca_file=upload.ca_file and folder / upload.ca_file, pins=upload.pins)
+        server.ask("GET", "/healthz", timeout_s=NETWORK_S)
+    except (UploadError, InputError, OSError) as error:
+        text, _, mend = str(error).partition("; ")
+        yield Finding(
+            "error", "server", text, mend or "check the address, the network, and that robotd-solver serve runs there"
         )
-        yield Finding("error", "server", f"{url} cannot be reached: {reason}", mend)
         return
     yield Finding("ok", "server", f"{url} answers")
-    if config.upload.token_credential is not None or (token_file is not None and not os.access(token_file, os.R_OK)):
+    if url.startswith("http:") and urlsplit(url).hostname not in LOOPBACK:
+        yield Finding(
+            "warning",
+            "server",
+            f"stops and the token go to {url} unencrypted",
+            "start robotd-solver serve with --certificate, and write https into [upload] url",
+        )
+    if not is_ours:
         yield Finding("note", "token", "only robotd has it; robotctl status says whether the server takes it")
         return
     try:
-        token = None if token_file is None else token_file.read_text().strip()
-        _get(f"{url.rstrip('/')}/api/surveys", token)
-    except urllib.error.HTTPError as error:
-        words = "refuses the token" if error.code in (401, 403) else f"answers {error.code}"
-        yield Finding(
-            "error", "token", f"{url} {words}", "copy the token of robotd-solver serve --token-file into token_file"
-        )
-    except (OSError, ValueError) as error:
+        status, _ = server.ask("GET", "/api/surveys", timeout_s=NETWORK_S, limit=ANSWERS)
+    except UploadError as error:
         yield Finding("error", "token", f"it could not be tried: {error}", "mend what is said above")
-    else:
+        return
+    if status == 200:
         yield Finding("ok", "token", "the server takes it")
-
-
-def _get(url: str, token: str | None) -> bytes:
-    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-    with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=NETWORK_S) as answer:
-        return bytes(answer.read(1 << 16))
+        return
+    words = "refuses the token" if status in (401, 403) else f"answers {status}"
+    yield Finding(
+        "error", "token", f"{url} {words}", "copy the token of robotd-solver serve --token-file into token_file"
+    )
 
 
 def check_together(control: Path, seconds: float) -> Iterator[Finding]:

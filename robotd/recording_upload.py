@@ -16,12 +16,10 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
 
-import aiohttp
-import yarl
-
-from .clock import in_thread, outside
+from .clock import in_thread
 from .errors import UploadError
 from .files import write_atomic
+from .web import WebServer
 
 PIECE = 1 << 20  # bytes
 LONGEST = 64  # times retry_s: the longest pause
@@ -37,10 +35,8 @@ class RecordingUploader:
     ----------
     directory : Path
         Where "*.mcap" lie.
-    url : str
-        Of the server.
-    token : str or None
-        Secret shared with the server.
+    server : WebServer
+        Where they go.
     retry_s, timeout_s : float
         First pause after a failure, which doubles up to 64 times that; longest wait for an answer.
     delete : bool
@@ -52,8 +48,7 @@ class RecordingUploader:
     def __init__(
         self,
         directory: Path,
-        url: str,
-        token: str | None,
+        server: WebServer,
         *,
         retry_s: float,
         timeout_s: float,
@@ -61,12 +56,12 @@ class RecordingUploader:
         report: Report,
     ) -> None:
         self.directory = directory
-        self.url = url.rstrip("/")
+        self.server = server
+        self.url = server.url
         self.retry_s = retry_s
         self.timeout_s = timeout_s
         self.delete = delete
         self.report = report
-        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._wake = asyncio.Event()
         self._wake.set()
         self._empty = asyncio.Event()
@@ -85,48 +80,45 @@ class RecordingUploader:
     async def run(self) -> None:
         """Send until cancelled."""
         pause = self.retry_s
-        connector = aiohttp.TCPConnector(force_close=True)
-        async with aiohttp.ClientSession(headers=self._headers, connector=connector) as session:
-            while True:
-                await self._wake.wait()
-                self._wake.clear()
-                try:
-                    for path in await in_thread(self._waiting):
-                        await self._offer(session, path)
-                except UploadError as error:
-                    if str(error) != self._trouble:
-                        self.report(f"{error}; recordings are kept and sent again", "warning")
-                    self._trouble = str(error)
-                    self._wake.set()
-                    await asyncio.sleep(pause)
-                    pause = min(2.0 * pause, LONGEST * self.retry_s)
-                else:
-                    pause, self._trouble = self.retry_s, None
-                    if not self._wake.is_set():
-                        self._empty.set()
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            try:
+                for path in await in_thread(self._waiting):
+                    await self._offer(path)
+            except UploadError as error:
+                if str(error) != self._trouble:
+                    self.report(f"{error}; recordings are kept and sent again", "warning")
+                self._trouble = str(error)
+                self._wake.set()
+                await asyncio.sleep(pause)
+                pause = min(2.0 * pause, LONGEST * self.retry_s)
+            else:
+                pause, self._trouble = self.retry_s, None
+                if not self._wake.is_set():
+                    self._empty.set()
 
     def _waiting(self) -> list[Path]:
         files = sorted(self.directory.glob("*.mcap")) if self.directory.is_dir() else []
         return [path for path in files if path.stem not in self._refused and not uploaded_mark(path).exists()]
 
-    async def _offer(self, session: aiohttp.ClientSession, path: Path) -> None:
+    async def _offer(self, path: Path) -> None:
         try:
-            await self._send(session, path)
+            await self._send(path)
         except UploadError as error:
             if not error.permanent:
                 raise
             self._refused.add(path.stem)  # until the next start
             self.report(f"{path.name} is refused and stays on the robot: {error}", "error")
 
-    async def _send(self, session: aiohttp.ClientSession, path: Path) -> None:
+    async def _send(self, path: Path) -> None:
         """Bring one recording to the server; raises UploadError."""
         try:
             size, digest = await in_thread(_measure, path)
         except OSError as error:
             raise UploadError(f"{path}: cannot be read: {error.strerror or error}", permanent=True) from error
-        address = f"{self.url}/api/recordings/{quote(path.stem, safe='')}"
-        question = f"{address}?size={size}&sha256={digest.hex()}"
-        at, complete = self._understood(await self._exchange(session, "GET", question))
+        target = f"/api/recordings/{quote(path.stem, safe='')}"
+        at, complete = await self._exchange("GET", f"{target}?size={size}&sha256={digest.hex()}")
         while not complete:
             before = at
             body = await in_thread(_read, path, at)
@@ -138,7 +130,7 @@ class RecordingUploader:
                 "Content-Digest": _spelled(hashlib.sha256(body).digest()),
                 "Repr-Digest": _spelled(digest),
             }
-            at, complete = self._understood(await self._exchange(session, "PUT", address, body, headers))
+            at, complete = await self._exchange("PUT", target, body=body, headers=headers)
             if at <= before and not complete:
                 raise UploadError(f"{self.url} has lost a part of {path.name}, it gets that again")
             if self._trouble is not None:
@@ -147,38 +139,13 @@ class RecordingUploader:
         await in_thread(_settle, path, self.url, digest, delete=self.delete)
         self.report(f"{path.name} is on the server ({size / 1e6:.1f} MB)", "info")
 
-    async def _exchange(
-        self,
-        session: aiohttp.ClientSession,
-        method: str,
-        address: str,
-        body: bytes | None = None,
-        headers: dict[str, str] | None = None,
-    ) -> tuple[int, Any]:
-        """One request; returns status and JSON of the answer."""
+    async def _exchange(self, method: str, target: str, **more: Any) -> tuple[int, bool]:
+        """One request; returns the bytes that the server has, and whether it has the whole. Raises UploadError."""
+        status, answer = await self.server.exchange(method, target, timeout_s=self.timeout_s, **more)
         try:
-            with outside():
-                async with session.request(
-                    method,
-                    yarl.URL(address, encoded=True),
-                    data=body,
-                    headers=headers,
-                    timeout=aiohttp.ClientTimeout(total=self.timeout_s),
-                    allow_redirects=False,
-                ) as response:
-                    status, answer = response.status, await response.read()
-        except TimeoutError as error:
-            raise UploadError(f"{self.url} did not answer within {self.timeout_s:g} s") from error
-        except (aiohttp.ClientError, OSError) as error:
-            raise UploadError(f"{self.url} cannot be reached: {error or type(error).__name__}") from error
-        try:
-            return status, json.loads(answer)
+            said = json.loads(answer)
         except ValueError:
-            return status, None
-
-    def _understood(self, answer: tuple[int, Any]) -> tuple[int, bool]:
-        """Bytes that the server has, and whether it has the whole; raises UploadError."""
-        status, said = answer
+            said = None
         received = said.get("received") if isinstance(said, dict) else None
         if isinstance(received, int) and status in (200, 201, 409):
             return received, said.get("complete") is True

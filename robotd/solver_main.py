@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument(
         "--recording-limit-gb", type=float, default=16.0, metavar="GB", help="largest recording (default: 16)"
     )
+    serve.add_argument(
+        "--certificate", type=Path, nargs=2, metavar=("CERT", "KEY"), help="serve https: certificate and its key (PEM)"
+    )
     serve.set_defaults(run=_serve)
     _add_calibrate(commands)
     workbench_tool.add(commands)
@@ -325,7 +328,8 @@ def _serve(arguments: argparse.Namespace) -> int:
             raise
         raise RobotdError(f"serving needs {error.name}, which is not installed; install robotd[solver]") from error
     limit = round(1e9 * arguments.recording_limit_gb)
-    serve(arguments.host, arguments.port, arguments.data, token, recording_limit=limit)
+    pair = None if arguments.certificate is None else tuple(arguments.certificate)
+    serve(arguments.host, arguments.port, arguments.data, token, recording_limit=limit, certificate=pair)
     return 0
 
 

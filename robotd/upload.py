@@ -3,7 +3,7 @@
 A request names the SHA-256 of its body, the server's answer repeats it, and only then is the record acknowledged: an
 answer of something between (a captive portal, a proxy) cannot make a stop disappear. A failure that may pass is tried
 again with growing pauses; a record that the server refuses for its content is reported once and offered again rarely,
-while the others go on. On a virtual loop a request takes no time, so there is no time limit on it either.
+while the others go on.
 """
 
 from __future__ import annotations
@@ -13,21 +13,20 @@ import base64
 import json
 from collections.abc import Callable
 from typing import Any, Literal
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
-import aiohttp
-import yarl
-
-from .clock import in_thread, now, outside
+from .clock import in_thread, now
 from .errors import InputError, UploadError
 from .files import map_from_json
 from .journal import Journal
 from .journal_records import Upload
 from .records import Map
+from .web import WebServer
 
 LONGEST = 64  # times retry_s: the longest pause, and the pause between offers of a refused record
 PASSING = (400, 401, 403, 408, 429)  # damaged on the way, a token to be mended on either side, "later"
 SOLVING_S = 600.0  # s, a map of a large store takes minutes
+MAP_LIMIT = 32 << 20  # bytes; a map of 10 000 labels, each seen ten times, has 15 million
 
 Report = Callable[[str, Literal["info", "warning", "error"]], None]
 
@@ -38,36 +37,23 @@ class Uploader:
     Parameters
     ----------
     journal : Journal
-    url : str
-        Of the server, e.g. "https://solver.example:8443".
-    token : str or None
-        Secret shared with the server.
+    server : WebServer
+        Where records go.
     retry_s : float
         First pause after a failure in seconds; doubles up to 64 times that.
     timeout_s : float
         Longest wait for an answer in seconds.
     report : callable
         Gets a sentence and its level, once per change of state.
-
-    Raises
-    ------
-    InputError
-        If the url is not one.
     """
 
-    def __init__(
-        self, journal: Journal, url: str, token: str | None, retry_s: float, timeout_s: float, report: Report
-    ) -> None:
-        parts = urlsplit(url)
-        if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
-            raise InputError(f"upload.url: found '{url}'; expected an address like https://solver.example:8443")
+    def __init__(self, journal: Journal, server: WebServer, retry_s: float, timeout_s: float, report: Report) -> None:
         self.journal = journal
-        self.url = url.rstrip("/")
-        self.token = token
+        self.server = server
+        self.url = server.url
         self.retry_s = retry_s
         self.timeout_s = timeout_s
         self.report = report
-        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._wake = asyncio.Event()
         self._empty = asyncio.Event()
         self._factor = 1
@@ -90,17 +76,16 @@ class Uploader:
 
     async def run(self) -> None:
         """Send until cancelled."""
-        async with self._session() as session:
-            while True:
-                self._wake.clear()
-                pause = await self._send_all(session)
-                if pause is None and not self._wake.is_set():
-                    self._empty.set()
-                try:
-                    async with asyncio.timeout(pause):
-                        await self._wake.wait()
-                except TimeoutError:
-                    pass
+        while True:
+            self._wake.clear()
+            pause = await self._send_all()
+            if pause is None and not self._wake.is_set():
+                self._empty.set()
+            try:
+                async with asyncio.timeout(pause):
+                    await self._wake.wait()
+            except TimeoutError:
+                pass
 
     async def fetch_map(self, survey: str) -> Map:
         """The server's map of a survey; waits while it is being solved.
@@ -110,9 +95,8 @@ class Uploader:
         UploadError
             If the server cannot be reached, says why there is no map, or sends something else.
         """
-        async with self._session() as session:
-            address = f"{self._address(survey)}/map"
-            body = await self._exchange(session, "GET", address, timeout_s=max(SOLVING_S, self.timeout_s))
+        target = f"{_target(survey)}/map"
+        body = await self._exchange("GET", target, timeout_s=max(SOLVING_S, self.timeout_s), limit=MAP_LIMIT)
         try:
             return map_from_json(body, f"the map from {self.url}")
         except InputError as error:
@@ -120,7 +104,7 @@ class Uploader:
 
     # ---- one round ---------------------------------------------------------------------------------------------------
 
-    async def _send_all(self, session: aiohttp.ClientSession) -> float | None:
+    async def _send_all(self) -> float | None:
         """Offer everything once; returns seconds until the next try is due, None if nothing is left."""
         due: list[float] = []
         held: set[str] = set()  # surveys whose header the server refuses: their stops wait behind it
@@ -134,7 +118,7 @@ class Uploader:
                     held.add(upload.survey)
                 continue
             try:
-                await self._send(session, upload)
+                await self._send(upload)
             except UploadError as error:
                 if not error.permanent:
                     return self._failed(str(error))
@@ -164,16 +148,16 @@ class Uploader:
         self._trouble = None
         self._factor = 1
 
-    async def _send(self, session: aiohttp.ClientSession, upload: Upload) -> None:
-        address = self._address(upload.survey)
+    async def _send(self, upload: Upload) -> None:
+        target = _target(upload.survey)
         if upload.kind == "stop":
-            address += f"/legs/{upload.leg}/stops/{upload.stop}"
+            target += f"/legs/{upload.leg}/stops/{upload.stop}"
         hashed = base64.b64encode(bytes.fromhex(upload.digest)).decode()
         headers = {"Content-Type": "application/json", "Content-Digest": f"sha-256=:{hashed}:"}  # RFC 9530
         if upload.replaces is not None:
             headers["If-Match"] = f'"{upload.replaces}"'  # RFC 9110, section 13.1.1
         try:
-            answer = await self._exchange(session, "PUT", address, body=upload.body, headers=headers)
+            answer = await self._exchange("PUT", target, body=upload.body, headers=headers)
         except _MissingError as error:
             if upload.kind == "header":
                 raise
@@ -188,29 +172,9 @@ class Uploader:
                 f"{self.url} does not answer like a robotd-solver; check upload.url and what is in between"
             )
 
-    async def _exchange(
-        self,
-        session: aiohttp.ClientSession,
-        method: str,
-        address: str,
-        *,
-        body: bytes | None = None,
-        headers: dict[str, str] | None = None,
-        timeout_s: float | None = None,
-    ) -> bytes:
+    async def _exchange(self, method: str, target: str, *, timeout_s: float | None = None, **more: Any) -> bytes:
         """One request; returns the answer's body. Every failure is an UploadError that names the server."""
-        limit = aiohttp.ClientTimeout(total=timeout_s or self.timeout_s)
-        target = yarl.URL(address, encoded=True)
-        try:
-            with outside():
-                async with session.request(
-                    method, target, data=body, headers=headers, timeout=limit, allow_redirects=False
-                ) as response:
-                    status, answer = response.status, await response.read()
-        except TimeoutError as error:
-            raise UploadError(f"{self.url} did not answer within {limit.total:g} s") from error
-        except (aiohttp.ClientError, OSError) as error:
-            raise UploadError(f"{self.url} cannot be reached: {error or type(error).__name__}") from error
+        status, answer = await self.server.exchange(method, target, timeout_s=timeout_s or self.timeout_s, **more)
         if status < 300:
             return answer
         text = f"{self.url} answers {status}: {_reason(answer)}"
@@ -218,16 +182,13 @@ class Uploader:
             raise _MissingError(text, permanent=True)
         raise UploadError(text, permanent=400 <= status < 500 and status not in PASSING)
 
-    def _session(self) -> aiohttp.ClientSession:
-        # a connection per request: stops are minutes apart, and a kept one would often be dead
-        return aiohttp.ClientSession(headers=self._headers, connector=aiohttp.TCPConnector(force_close=True))
-
-    def _address(self, survey: str) -> str:
-        return f"{self.url}/api/surveys/{quote(survey, safe='')}"
-
 
 class _MissingError(UploadError):
     """The server knows nothing under that address."""
+
+
+def _target(survey: str) -> str:
+    return f"/api/surveys/{quote(survey, safe='')}"
 
 
 def _name(upload: Upload) -> str:

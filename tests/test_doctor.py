@@ -169,9 +169,9 @@ def test_clock_power_token_and_calibration(tmp_path):
 
 
 def test_a_server_that_is_not_there_and_a_daemon_that_is_not_there(tmp_path):
-    assert levels(check_server(Config(), None)) == [("note", "server")]
+    assert levels(check_server(Config(), tmp_path)) == [("note", "server")]
     away = Config(upload=UploadConfig(url="http://127.0.0.1:9"))
-    assert levels(check_server(away, None)) == [("error", "server")]
+    assert levels(check_server(away, tmp_path)) == [("error", "server")]
     assert levels(check_together(tmp_path / "none.sock", 1.0)) == [("warning", "robotd")]
 
 

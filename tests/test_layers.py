@@ -36,7 +36,7 @@ LAYERS = {
     2: [
         *("clock", "link", "real", "config", "files", "bus", "hardware", "journal", "upload", "telemetry", "recording"),
         "recording_upload",
-        *("journal_records", "secret_file"),
+        *("journal_records", "secret_file", "web"),
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "prompt", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
         "roof",
@@ -170,6 +170,7 @@ import sys
 from robotd.__main__ import main
 assert main(["check", "-c", sys.argv[1]]) == 0
 import robotd.daemon, robotd.mission, robotd.real
+assert "aiohttp" not in sys.modules  # a second of a Pi's time at the start; network cameras need it
 from robotd.plugin import available
 for point in available().values():
     point.load()

@@ -17,6 +17,7 @@ from robotd.recording_upload import PIECE, RecordingUploader, uploaded_mark
 from robotd.server.app import create_app
 from robotd.server.recordings import OffsetError, Plan, RecordingStore, TooLargeError
 from robotd.server.store import ConflictError, Store, StoreError
+from robotd.web import WebServer
 
 TOKEN = "secret"
 
@@ -201,7 +202,10 @@ async def bad_link(port, cuts):
 def uploader(tmp_path, port, told, **options):
     options = {"retry_s": 0.01, "timeout_s": 5.0, "delete": False} | options
     return RecordingUploader(
-        tmp_path / "robot", f"http://127.0.0.1:{port}", TOKEN, report=lambda *said: told.append(said), **options
+        tmp_path / "robot",
+        WebServer(f"http://127.0.0.1:{port}", TOKEN),
+        report=lambda *said: told.append(said),
+        **options,
     )
 
 

@@ -23,6 +23,8 @@ from urllib.parse import quote
 import pytest
 import uvicorn
 
+from robotd.config import Config, UploadConfig
+from robotd.doctor import check_server
 from robotd.errors import InputError, SolverError
 from robotd.files import map_from_json, map_to_json, survey_from_json, survey_to_json
 from robotd.journal_records import header_body, stop_body
@@ -31,6 +33,7 @@ from robotd.server import jobs
 from robotd.server.app import create_app, serve
 from robotd.server.jobs import JobError, MapJobs, worker_pool
 from robotd.server.store import ConflictError, Store, StoreError, UnknownSurveyError
+from tests.certificates import VALID, certify, fingerprint, needs_openssl
 from tests.store_surveys import noisy_room
 
 TOKEN = "secret"
@@ -400,18 +403,20 @@ SERVE = """
 import sys
 from pathlib import Path
 from robotd.server.app import serve
-serve("127.0.0.1", 0, Path(sys.argv[1]), "secret")
+certificate = tuple(map(Path, sys.argv[2:])) or None
+serve("127.0.0.1", 0, Path(sys.argv[1]), "secret", certificate=certificate)
 """
 
 
 @contextmanager
-def program(data):
-    with subprocess.Popen([sys.executable, "-c", SERVE, str(data)], stdout=subprocess.PIPE, text=True) as process:
+def program(data, *certificate):
+    command = [sys.executable, "-c", SERVE, *map(str, (data, *certificate))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         line = process.stdout.readline()
-        assert line.startswith("robotd-solver: listening on http://127.0.0.1:")
+        assert line.startswith(f"robotd-solver: listening on http{'s' if certificate else ''}://127.0.0.1:")
         port = int(line.rsplit(":", 1)[1])
         try:
-            yield SimpleNamespace(process=process, ask=lambda *args, **kwargs: ask(port, *args, **kwargs))
+            yield SimpleNamespace(process=process, port=port, ask=lambda *args, **kwargs: ask(port, *args, **kwargs))
         finally:
             process.kill()
 
@@ -423,6 +428,24 @@ def test_what_was_acknowledged_survives_kill_9(tmp_path):
         assert [stop["stop"] for stop in second.ask("GET", ROOM)[1]["stops"]] == [1, 2]
         second.process.send_signal(signal.SIGTERM)
         assert second.process.wait(20) in (0, -signal.SIGTERM)
+
+
+@needs_openssl
+def test_over_tls_a_robot_is_served_and_doctor_sees_which_server_and_token_it_is(tmp_path):
+    certificate, key = certify(tmp_path, "server", "127.0.0.1", VALID)
+    with program(tmp_path, certificate, key) as server:
+        url = f"https://127.0.0.1:{server.port}"
+        for token, pins, expected in (
+            ("secret", [fingerprint(certificate)], [("ok", "server"), ("ok", "token")]),
+            ("wrong", [], [("ok", "server"), ("error", "token")]),
+            ("secret", ["0" * 64], [("error", "server")]),
+        ):
+            (tmp_path / "token").write_text(token)
+            upload = UploadConfig(url=url, token_file=Path("token"), ca_file=Path("server.pem"), pins=tuple(pins))
+            found = list(check_server(Config(upload=upload), tmp_path))
+            assert [(item.level, item.what) for item in found] == expected, found
+    with pytest.raises(InputError, match=r"certificate .*server.key with key .* cannot be used"):
+        serve("127.0.0.1", 0, tmp_path, None, certificate=(key, key))
 
 
 def test_addresses_that_cannot_be_had_are_explained(tmp_path):

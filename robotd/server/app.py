@@ -30,6 +30,7 @@ import logging
 import re
 import signal
 import socket
+import ssl
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -179,6 +180,7 @@ def serve(
     ready: Callable[[str], None] = announce,
     *,
     recording_limit: int = 16 << 30,
+    certificate: tuple[Path, Path] | None = None,
 ) -> None:
     """Serve until SIGTERM or Ctrl-C.
 
@@ -194,14 +196,18 @@ def serve(
         Called with the server's address once it answers.
     recording_limit : int
         Bytes that a recording may have.
+    certificate : tuple of two Path, optional
+        Files (PEM) of the certificate and its key: serves https.
 
     Raises
     ------
     InputError
-        If the address cannot be had.
+        If the address cannot be had, or the certificate cannot be used.
     """
     if token is None and host not in ("127.0.0.1", "::1", "localhost"):
         raise InputError(f"host {host}: without a token only 127.0.0.1 may be served; give --token-file")
+    if certificate is not None:
+        _check_certificate(*certificate)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     with listener:
@@ -213,7 +219,7 @@ def serve(
                 f"cannot listen on {host} port {port}: {error.strerror or error}; name another one"
             ) from error
         name = f"[{host}]" if family == socket.AF_INET6 else host
-        url = f"http://{name}:{listener.getsockname()[1]}"
+        url = f"{'http' if certificate is None else 'https'}://{name}:{listener.getsockname()[1]}"
         config = uvicorn.Config(
             create_app(Store(data), token, recordings=RecordingStore(data, recording_limit)),
             log_level="warning",
@@ -221,12 +227,22 @@ def serve(
             limit_concurrency=256,
             timeout_graceful_shutdown=5,  # s; a map that is being solved does not hold up the end
             ws="none",
+            ssl_certfile=None if certificate is None else certificate[0],
+            ssl_keyfile=None if certificate is None else certificate[1],
         )
         if threading.current_thread() is threading.main_thread():
             # uvicorn raises the signal again after its clean shutdown, which would cut ours short
             signal.signal(signal.SIGTERM, lambda *_: None)
         with suppress(KeyboardInterrupt):
             _Server(config, lambda: ready(url)).run(sockets=[listener])
+
+
+def _check_certificate(certificate: Path, key: Path) -> None:
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        why = error.strerror or error
+        raise InputError(f"certificate {certificate} with key {key}: cannot be used: {why}; give PEM files") from error
 
 
 class _Server(uvicorn.Server):  # type: ignore[misc]
