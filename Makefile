@@ -15,7 +15,7 @@ demo: $(READY)
 	$(BIN)/robotd demo --out out/demo
 
 test: $(DEV)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 check: $(DEV)
 	$(BIN)/ruff format --check .

@@ -245,7 +245,9 @@ QUIRKS = [  # switch, its value, what is done, what a robot as in the manual doe
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "scenario", "plain", "odd"), QUIRKS, ids=lambda item: str(item)[:40])
+@pytest.mark.parametrize(
+    ("name", "value", "scenario", "plain", "odd"), QUIRKS, ids=lambda item: getattr(item, "__name__", str(item))
+)
 def test_a_quirk_changes_this_and_the_manual_s_robot_does_that(name, value, scenario, plain, odd):
     assert scenario(Wire()) == plain
     assert scenario(Wire(**{name: value})) == odd
