@@ -62,7 +62,8 @@ class MissionConfig:
 
     With `stop_at` "distances" the robot stops at `stops`, metres along the line; with "markers" where it starts, then
     at each square or dot beside the line, until the line ends or `marker_stops` stops are made. `camera_groups` are
-    the rig's cameras that look at the same time, one group after the other; empty: all at once.
+    the rig's cameras that look at the same time, one group after the other; empty: all at once. `resume` says whether a
+    mission whose process ended goes on by itself where nothing speaks against it, or waits for an operator.
     """
 
     survey: str = "store"
@@ -76,6 +77,14 @@ class MissionConfig:
     marker_stops: int = ranged(0, minimum=0, maximum=10000)
     mains_hz: Literal[50, 60] = 50
     camera_groups: tuple[tuple[str, ...], ...] = ()
+    resume: Literal["ask", "auto"] = "ask"
+    low_charge: float = ranged(0.10, minimum=0.0, maximum=1.0)
+    enough_charge: float = ranged(0.25, minimum=0.0, maximum=1.0)
+    low_voltage: float = ranged(12.5, minimum=0.0, maximum=30.0)
+    enough_voltage: float = ranged(13.5, minimum=0.0, maximum=30.0)
+    keep_free_mb: float = ranged(200.0, minimum=0.0, maximum=1e6)
+    least_labels: int = ranged(1, minimum=0, maximum=10000)
+    if_fewer: Literal["flag", "repeat"] = "flag"
     zones: tuple[Zone, ...] = ()
 
     def __post_init__(self) -> None:
@@ -83,6 +92,10 @@ class MissionConfig:
             raise ValueError(f"stops = {list(self.stops)}; expected increasing distances in metres")
         if self.stops and self.stops[0] < 0:
             raise ValueError(f"stops[0] = {self.stops[0]}; expected at least 0")
+        for name in ("charge", "voltage"):
+            low, enough = getattr(self, f"low_{name}"), getattr(self, f"enough_{name}")
+            if enough < low:
+                raise ValueError(f"enough_{name} = {enough:g}; expected at least low_{name} = {low:g}")
         if self.stop_at == "markers" and not self.marker_stops:
             raise ValueError("marker_stops = 0; expected with stop_at = 'markers' how many stops to make at most")
         counts = Counter(self.labels)

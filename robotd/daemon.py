@@ -12,6 +12,7 @@ import logging
 from collections import Counter
 from collections.abc import Coroutine, Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,14 +22,14 @@ from .clock import in_thread, now, ticks
 from .config import Calibration, Config, collect, load_calibration, load_config, read_toml
 from .control import ControlLoop
 from .control_socket import ControlSocket
-from .errors import ConfigError, InputError, MissionError, UploadError
-from .files import map_to_json
+from .errors import ConfigError, InputError, StorageError
 from .hardware import CameraMode, Hardware, flicker_free
 from .journal import Journal
-from .mission import Health, Mission, complete_map
+from .mission import Mission
+from .mission_keeper import MissionKeeper
 from .notify import notify
 from .odometry import Odometry
-from .plugin import Base, Camera, Driver, Follower, Labels, load
+from .plugin import Base, Camera, Driver, Follower, load
 from .recorder import Recordings
 from .recording_upload import RecordingUploader
 from .records import Event, Map
@@ -42,6 +43,7 @@ from .web import WebServer
 log = logging.getLogger("robotd")
 
 TRAIL_S = 0.1
+CLOCK_S, STEP_S = 10.0, 1.0  # between two looks at the date; a change by more than so much is a step
 LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
 
@@ -242,18 +244,13 @@ class Daemon:
 
     Attributes
     ----------
-    map : Map or None
-        After a mission: the server's map, completed with the labels that were never seen.
-    mission : Mission or None
-        The one that runs, or the last one.
+    missions : MissionKeeper
     journal : Journal
     uploader : Uploader or None
     """
 
     def __init__(self, assembly: Assembly) -> None:
         self.assembly = assembly
-        self.map: Map | None = None
-        self.mission: Mission | None = None
         config, bus = assembly.config, assembly.bus
         self.odometry = Odometry(assembly.calibration.wheels)
         blind = cast(Follower, assembly.follower).blind
@@ -264,7 +261,17 @@ class Daemon:
         self.uploader: Uploader | None = None
         self._group: asyncio.TaskGroup
         self._uploading: list[asyncio.Task[None]] = []
-        self._running: asyncio.Task[None] | None = None  # the operator's mission
+        self.missions = MissionKeeper(self)
+
+    @property
+    def mission(self) -> Mission | None:
+        """The mission that runs, or the last one."""
+        return self.missions.mission
+
+    @property
+    def map(self) -> Map | None:
+        """After a mission: the server's map, completed with the labels that were never seen."""
+        return self.missions.map
 
     @property
     def state(self) -> Path:
@@ -276,14 +283,13 @@ class Daemon:
         assembly = self.assembly
         self.journal = journal = await in_thread(Journal.open, self.state / "journal.sqlite")
         try:
-            hardware = assembly.hardware
-            synchronised = hardware.is_synchronised()
-            await in_thread(journal.note_clock, hardware.boot_id(), now(), hardware.utc(), synchronised=synchronised)
+            await self._note_clock()
             uploader = self._uploader()
             async with asyncio.TaskGroup() as self._group:
                 work = [
                     self._log_events(journal),
                     self._keep_trail(journal),
+                    self._watch_clock(),
                     self.control.run(),
                     self.recordings.run(),
                     *(supervisor.run() for supervisor in self.supervisors),
@@ -295,8 +301,9 @@ class Daemon:
                 tasks = [self._group.create_task(item) for item in work]
                 self._upload_by(uploader)
                 notify("READY=1\nSTATUS=ready")
+                await self.missions.restore()
                 if mission:
-                    await self._run_mission(await self._begin_mission())
+                    await self.missions.run()
                     for task in (*tasks, *self._uploading):
                         task.cancel()
         finally:
@@ -314,24 +321,6 @@ class Daemon:
         return self._group.create_task(work)
 
     # ---- the operator's part -----------------------------------------------------------------------------------------
-
-    @property
-    def is_on_mission(self) -> bool:
-        """Whether a mission runs that an operator started; the robot is his otherwise."""
-        return self._running is not None and not self._running.done()
-
-    async def start_mission(self, *, survey: str | None = None, first_stop: int = 1) -> None:
-        """Begin a mission that an operator attends; a MissionError or InputError says why not."""
-        if self.is_on_mission:
-            raise MissionError("a mission is under way; robotctl mission abort ends it")
-        if (held := self.control.gate.latched) is not None and held.startswith("emergency stop"):
-            raise MissionError(f"the robot is held: {held}; robotctl release first")
-        self._running = self.spawn(asyncio.sleep(0))  # because a second start must not come in between
-        follower = next(item for item in self.supervisors if item.driver is self.assembly.follower)
-        follower.restart()  # because what it remembers is in the axes of the last leg
-        mission = await self._begin_mission(survey=survey, first_stop=first_stop, is_attended=True)
-        self.odometry.restart()
-        self._running = self.spawn(self._run_mission(mission))
 
     def reconfigure(self, config: Config, drivers: Mapping[str, Driver]) -> None:
         """Go on with another configuration, and with these drivers in place of those of the same names."""
@@ -418,67 +407,8 @@ class Daemon:
         self.recordings.finished = recordings.wake
         return recordings
 
-    async def _begin_mission(
-        self, *, survey: str | None = None, first_stop: int = 1, is_attended: bool = False
-    ) -> Mission:
-        assembly, config = self.assembly, self.assembly.config
-        identify = replace(
-            config.mission.identify,
-            gamma=assembly.calibration.gamma,
-            row_time_s=assembly.calibration.row_time_s,
-            exposure_s=flicker_free(config.mission.identify.exposure_s, config.mission.mains_hz),
-        )
-        mission = Mission(
-            replace(config.mission, identify=identify, survey=survey or config.mission.survey),
-            assembly.calibration,
-            bus=assembly.bus,
-            hardware=assembly.hardware,
-            base=cast(Base, assembly.base),
-            follower=cast(Follower, assembly.follower),
-            labels=cast(Labels, assembly.labels),
-            cameras={name: cast(Camera, driver) for name, driver in assembly.cameras.items()},
-            eye=cast(Camera, assembly.eye),
-            odometry=self.odometry,
-            journal=self.journal,
-            health=Health(self._fault, lambda: self.control.cause),
-            wake_upload=self._wake_upload,
-            first_stop=first_stop,
-            is_attended=is_attended,
-        )
-        await mission.begin()
-        self.mission = mission
-        return mission
-
-    def _wake_upload(self) -> None:
-        if self.uploader is not None:
-            self.uploader.wake()
-
-    async def _run_mission(self, mission: Mission) -> None:
-        assembly, uploader = self.assembly, self.uploader
-        self.control.resume("the mission's start")
-        await mission.run()
-        if uploader is not None:
-            await self._fetch_map(mission, uploader)
-        status = assembly.bus.status.latest
-        if status is not None:
-            assembly.bus.status.publish(replace(status, t=now(), state="done"))
-
-    async def _fetch_map(self, mission: Mission, uploader: Uploader) -> None:
-        config = self.assembly.config
-        try:
-            async with asyncio.timeout(config.mission.upload_wait_s):
-                await uploader.wait_empty()
-            solved = await uploader.fetch_map(mission.config.survey)
-        except (TimeoutError, UploadError) as error:
-            text = str(error) or f"the server did not take every stop within {config.mission.upload_wait_s:g} s"
-            self.assembly.bus.events.publish(
-                Event(now(), "upload", "error", f"no map yet: {text}; the stops are kept and sent at the next start")
-            )
-            return
-        self.map = complete_map(solved, config.mission.labels, len(mission.stops), mission.ended, mission.refused)
-        await in_thread(_write, self.state / "map.json", map_to_json(self.map))
-
-    def _fault(self) -> str | None:
+    def fault(self) -> str | None:
+        """Why a device does not work now, in words."""
         return next((supervisor.fault for supervisor in self.supervisors if supervisor.fault is not None), None)
 
     async def _log_events(self, journal: Journal) -> None:
@@ -486,6 +416,25 @@ class Daemon:
             async for event in events:
                 log.log(LEVELS[event.level], "%s: %s", event.source, event.text)
                 await in_thread(journal.add_event, event)
+
+    async def _note_clock(self) -> None:
+        """Note which date the loop's time is; without room for that dates are not sure, but the robot works."""
+        hardware = self.assembly.hardware
+        utc, synchronised = hardware.utc(), hardware.is_synchronised()
+        self._clock = utc - timedelta(seconds=now()), synchronised
+        try:
+            await in_thread(self.journal.note_clock, hardware.boot_id(), now(), utc, synchronised=synchronised)
+        except StorageError as error:
+            log.warning("%s", error)
+
+    async def _watch_clock(self) -> None:
+        """Note the date anew when it steps, e.g. because a time server was reached."""
+        hardware = self.assembly.hardware
+        async for _ in ticks(CLOCK_S):
+            start, synchronised = self._clock
+            step = hardware.utc() - timedelta(seconds=now()) - start
+            if abs(step.total_seconds()) > STEP_S or hardware.is_synchronised() != synchronised:
+                await self._note_clock()
 
     async def _keep_trail(self, journal: Journal) -> None:
         rows: list[tuple[float, float, float, float]] = []
@@ -495,12 +444,8 @@ class Daemon:
             if state is not None and state is not last and (last is None or state.pose != last.pose):
                 rows.append((state.t, state.pose.x, state.pose.y, state.pose.heading))
                 last = state
-            if rows and tick % 10 == 0:
-                await in_thread(journal.add_trail, rows)
-                rows = []
-
-
-def _write(path: Path, data: bytes) -> None:
-    part = path.with_suffix(".part")
-    part.write_bytes(data)
-    part.replace(path)
+            if tick % 10 == 0:
+                note = self.missions.note()
+                if rows or note is not None:
+                    await in_thread(journal.add_trail, rows, note)
+                    rows = []

@@ -5,6 +5,7 @@
     │   └── ConfigError         ... a configuration, calibration or layout; lists every mistake at once
     ├── DriverFault             a device is unplugged, silent or talks garbage: halt, report, reopen with back-off
     ├── MissionError            the mission cannot go on (line lost, stop refused): pause, keep what was finished
+    │   └── StorageError        ... because the disk takes nothing more: wait for room, then do it again
     ├── UploadError             the server did not take a record: keep it and try again later
     └── SolverError             the survey cannot be solved at all; the message says which data is missing
 
@@ -40,6 +41,10 @@ class DriverFault(RobotdError):
 
 class MissionError(RobotdError):
     """The mission cannot go on; what was finished stays valid."""
+
+
+class StorageError(MissionError):
+    """The disk did not take a record; the same again will do once there is room."""
 
 
 class UploadError(RobotdError):

@@ -1,8 +1,8 @@
 """What the robot must not forget: an SQLite file that survives kill -9, power loss and a full card.
 
-Stops and survey headers are written on a connection with `synchronous=FULL`: when `add_stop` returns, the stop is on
-the disk, as the very bytes that will be uploaded, with their hash. What only helps to understand a mission afterwards
-(trail, slots, events) goes through a second connection with `synchronous=NORMAL`; the next stop makes it durable too.
+When `add_stop` returns, the stop is on the disk, as the very bytes that will be uploaded, with their hash. What only
+helps to understand a mission afterwards (trail, slots, events) is written less dearly; see `journal_file`. A mission
+notes how far it has come, with each stop in the same transaction, so that a daemon that is started again can go on.
 The upload queue is not a table of its own: it is every header and stop that the server has not acknowledged yet.
 
 Times are loop times (`t`); with the row of `clock` that was newest when they were written they become dates.
@@ -11,20 +11,21 @@ Times are loop times (`t`); with the row of `clock` that was newest when they we
 from __future__ import annotations
 
 import sqlite3
-import threading
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from datetime import datetime
 from pathlib import Path
 
 import msgspec
 
-from .errors import InputError, MissionError
+from .errors import InputError
+from .journal_file import JournalFile
 from .journal_records import (
     LoggedEvent,
+    MissionNote,
     StopSummary,
     SurveySummary,
+    Unfinished,
     Upload,
     date_after,
     digest,
@@ -35,91 +36,13 @@ from .journal_records import (
 )
 from .records import Event, Stop, Survey
 
-APPLICATION_ID = 0x726F626F  # "robo": tells our files from other SQLite files
-VERSION = 2
-SCHEMA = f"""
-BEGIN IMMEDIATE;
-CREATE TABLE clock (id INTEGER PRIMARY KEY, boot TEXT NOT NULL, t REAL NOT NULL, utc TEXT NOT NULL,
-    synchronised INTEGER NOT NULL);
-CREATE TABLE surveys (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, body BLOB NOT NULL, digest TEXT NOT NULL,
-    acknowledged INTEGER NOT NULL DEFAULT 0);
-CREATE TABLE legs (id INTEGER PRIMARY KEY, survey INTEGER NOT NULL REFERENCES surveys, leg INTEGER NOT NULL,
-    clock INTEGER REFERENCES clock);
-CREATE TABLE stops (id INTEGER PRIMARY KEY, survey INTEGER NOT NULL REFERENCES surveys, leg INTEGER NOT NULL,
-    stop INTEGER NOT NULL, body BLOB NOT NULL, digest TEXT NOT NULL, acknowledged INTEGER NOT NULL DEFAULT 0,
-    replaces TEXT, rejected TEXT, original BLOB, UNIQUE (survey, leg, stop));
-CREATE TABLE slots (id INTEGER PRIMARY KEY, leg INTEGER NOT NULL REFERENCES legs, stop INTEGER NOT NULL,
-    slot INTEGER NOT NULL, started REAL NOT NULL, ended REAL NOT NULL, clock INTEGER REFERENCES clock);
-CREATE TABLE events (id INTEGER PRIMARY KEY, t REAL NOT NULL, source TEXT NOT NULL, level TEXT NOT NULL,
-    text TEXT NOT NULL, clock INTEGER REFERENCES clock);
-CREATE TABLE trail (id INTEGER PRIMARY KEY, leg INTEGER REFERENCES legs, t REAL NOT NULL, x REAL NOT NULL,
-    y REAL NOT NULL, heading REAL NOT NULL, clock INTEGER REFERENCES clock);
-PRAGMA application_id = {APPLICATION_ID};
-PRAGMA user_version = {VERSION};
-COMMIT;
-"""
 
-FROM_1 = """
-BEGIN IMMEDIATE;
-ALTER TABLE stops ADD COLUMN replaces TEXT;
-ALTER TABLE stops ADD COLUMN rejected TEXT;
-ALTER TABLE stops ADD COLUMN original BLOB;
-PRAGMA user_version = 2;
-COMMIT;
-"""
-
-
-class Journal:
-    """The robot's journal; every method may be called from any thread and blocks until the disk has answered."""
+class Journal(JournalFile):
+    """The robot's journal."""
 
     def __init__(self, path: Path, sure: sqlite3.Connection, quick: sqlite3.Connection) -> None:
-        self.path = path
-        self.dropped = 0  # rows of trail, slots and events that the disk did not take
-        self._sure = sure
-        self._quick = quick
-        self._lock = threading.RLock()
-        self._clock: int | None = None
+        super().__init__(path, sure, quick)
         self._leg: int | None = None
-
-    @classmethod
-    def open(cls, path: Path) -> Journal:
-        """Open a journal, or make a new one (and its folder).
-
-        Raises
-        ------
-        InputError
-            If the file is damaged, is no journal, was made by a newer robotd or cannot be opened.
-        """
-        sure = None
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            sure = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
-            _check(sure, path)
-            quick = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
-            quick.execute("PRAGMA synchronous = NORMAL")
-            return cls(path, sure, quick)
-        except OSError as error:
-            raise InputError(f"{path}: the folder cannot be made: {error.strerror or error}") from error
-        except (sqlite3.Error, InputError) as error:
-            if sure is not None:
-                sure.close()
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"{path}: cannot be opened as a journal: {error}; move the file away to begin a new one"
-            ) from error
-
-    def close(self) -> None:
-        """Release the file; safe to call twice."""
-        with self._lock:
-            self._quick.close()
-            self._sure.close()
-
-    def __enter__(self) -> Journal:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # ---- surveys, legs, stops ----------------------------------------------------------------------------------------
 
@@ -140,29 +63,29 @@ class Journal:
         ------
         InputError
             If the name cannot be part of an address, or the survey has stops that were made with another header.
-        MissionError
+        StorageError
             If the disk does not take it.
         """
         problem = name_problem(header.survey)
         if problem:
             raise InputError(f"survey {header.survey!r}: {problem}; choose another name")
         header = replace(header, stops=())
-        with self._transaction():
-            row = self._sure.execute("SELECT id, body FROM surveys WHERE name = ?", (header.survey,)).fetchone()
+        with self.transaction():
+            row = self.sure.execute("SELECT id, body FROM surveys WHERE name = ?", (header.survey,)).fetchone()
             if row is None:
                 body = header_body(header)
-                survey = self._sure.execute(
+                survey = self.sure.execute(
                     "INSERT INTO surveys (name, body, digest) VALUES (?, ?, ?)", (header.survey, body, digest(body))
                 ).lastrowid
                 last = 0
             else:
                 survey = row[0]
-                (last,) = self._sure.execute(
+                (last,) = self.sure.execute(
                     "SELECT coalesce(max(leg), 0) FROM stops WHERE survey = ?", (survey,)
                 ).fetchone()
                 self._renew_header(survey, read_header(row[1]), header, has_stops=last > 0)
-            self._leg = self._sure.execute(
-                "INSERT INTO legs (survey, leg, clock) VALUES (?, ?, ?)", (survey, last + 1, self._clock)
+            self._leg = self.sure.execute(
+                "INSERT INTO legs (survey, leg, clock) VALUES (?, ?, ?)", (survey, last + 1, self.clock)
             ).lastrowid
         return int(last) + 1
 
@@ -177,43 +100,48 @@ class Journal:
                 "choose another survey name, or bring back the calibration it was begun with"
             )
         body = header_body(new)
-        self._sure.execute(
+        self.sure.execute(
             "UPDATE surveys SET body = ?, digest = ?, acknowledged = 0 WHERE id = ?", (body, digest(body), survey)
         )
 
-    def add_stop(self, survey: str, stop: Stop) -> None:
+    def add_stop(self, survey: str, stop: Stop, *, flag: str | None = None, note: MissionNote | None = None) -> None:
         """Put a finished stop on the disk; the same stop again changes nothing.
+
+        `flag` says what is doubtful about it, `note` how far the mission has come with it.
 
         Raises
         ------
         ValueError
             If the survey was not begun, the stop exists with another content, or a number in it is not finite.
-        MissionError
+        StorageError
             If the disk does not take it.
         """
         body = stop_body(stop)
         key = digest(body)
-        with self._transaction():
-            row = self._sure.execute("SELECT id FROM surveys WHERE name = ?", (survey,)).fetchone()
+        with self.transaction():
+            row = self.sure.execute("SELECT id FROM surveys WHERE name = ?", (survey,)).fetchone()
             if row is None:
                 raise ValueError(f"survey {survey!r} was not begun")
             place = (row[0], stop.leg, stop.stop)
-            old = self._sure.execute(
+            old = self.sure.execute(
                 "SELECT digest FROM stops WHERE survey = ? AND leg = ? AND stop = ?", place
             ).fetchone()
             if old is None:
-                self._sure.execute(
-                    "INSERT INTO stops (survey, leg, stop, body, digest) VALUES (?, ?, ?, ?, ?)", (*place, body, key)
+                self.sure.execute(
+                    "INSERT INTO stops (survey, leg, stop, body, digest, flag) VALUES (?, ?, ?, ?, ?, ?)",
+                    (*place, body, key, flag),
                 )
             elif old[0] != key:
                 raise ValueError(
                     f"survey {survey!r}: leg {stop.leg} stop {stop.stop} is in the journal with another content"
                 )
+            if note is not None:
+                self._update_mission(self.sure, note)
 
     def last_stop(self, survey: str) -> Stop | None:
         """The newest stop of a survey, or None."""
-        with self._lock:
-            row = self._sure.execute(
+        with self.lock:
+            row = self.sure.execute(
                 "SELECT stops.body FROM stops JOIN surveys ON surveys.id = stops.survey WHERE name = ? "
                 "ORDER BY leg DESC, stop DESC LIMIT 1",
                 (survey,),
@@ -222,25 +150,25 @@ class Journal:
 
     def survey(self, name: str) -> Survey:
         """A whole survey as the journal has it; raises InputError naming those it has."""
-        with self._lock:
-            row = self._sure.execute("SELECT id, body FROM surveys WHERE id = ?", (self.survey_id(name),)).fetchone()
-            bodies = self._sure.execute("SELECT body FROM stops WHERE survey = ? ORDER BY leg, stop", (row[0],))
+        with self.lock:
+            row = self.sure.execute("SELECT id, body FROM surveys WHERE id = ?", (self.survey_id(name),)).fetchone()
+            bodies = self.sure.execute("SELECT body FROM stops WHERE survey = ? ORDER BY leg, stop", (row[0],))
             stops = tuple(msgspec.json.decode(body, type=Stop) for (body,) in bodies)
         return replace(read_header(row[1]), stops=stops)
 
     def survey_id(self, name: str) -> int:
         """The row of a survey; raises InputError naming those there are."""
-        with self._lock:
-            row = self._sure.execute("SELECT id FROM surveys WHERE name = ?", (name,)).fetchone()
+        with self.lock:
+            row = self.sure.execute("SELECT id FROM surveys WHERE name = ?", (name,)).fetchone()
             if row is None:
-                known = [other for (other,) in self._sure.execute("SELECT name FROM surveys ORDER BY id")]
+                known = [other for (other,) in self.sure.execute("SELECT name FROM surveys ORDER BY id")]
                 raise InputError(f"{self.path}: no survey {name!r}; there is {', '.join(known) or 'none'}")
         return int(row[0])
 
     def surveys(self) -> dict[str, SurveySummary]:
         """Every survey, oldest first."""
-        with self._lock:
-            rows = self._sure.execute(
+        with self.lock:
+            rows = self.sure.execute(
                 "SELECT name, surveys.body, count(DISTINCT leg), count(stops.id), count(rejected), "
                 "(NOT surveys.acknowledged) + coalesce(sum(NOT stops.acknowledged), 0) "
                 "FROM surveys LEFT JOIN stops ON stops.survey = surveys.id GROUP BY surveys.id ORDER BY surveys.id"
@@ -250,13 +178,13 @@ class Journal:
     def stops(self, survey: str) -> list[StopSummary]:
         """Every stop of a survey, by leg and number; raises InputError naming the surveys there are."""
         self.survey_id(survey)
-        with self._lock:
-            rows = self._sure.execute(
-                "SELECT stops.body, stops.acknowledged, rejected FROM stops JOIN surveys ON surveys.id = stops.survey "
-                "WHERE name = ? ORDER BY leg, stop",
+        with self.lock:
+            rows = self.sure.execute(
+                "SELECT stops.body, stops.acknowledged, rejected, flag "
+                "FROM stops JOIN surveys ON surveys.id = stops.survey WHERE name = ? ORDER BY leg, stop",
                 (survey,),
             ).fetchall()
-        return [StopSummary(msgspec.json.decode(body, type=Stop), bool(sent), why) for body, sent, why in rows]
+        return [StopSummary(msgspec.json.decode(body, type=Stop), bool(sent), *rest) for body, sent, *rest in rows]
 
     def reject(self, survey: str, leg: int, stop: int, reason: str) -> None:
         """Leave a stop's sightings out of the survey; where the robot stood stays, for the stops around it.
@@ -265,7 +193,7 @@ class Journal:
         ------
         InputError
             If there is no such stop, or it is rejected already.
-        MissionError
+        StorageError
             If the disk does not take it.
         """
         body, rejected, _ = self._stop_row(survey, leg, stop)
@@ -282,8 +210,8 @@ class Journal:
         self._replace_stop(survey, leg, stop, original, None, None)
 
     def _stop_row(self, survey: str, leg: int, stop: int) -> tuple[bytes, str | None, bytes | None]:
-        with self._lock:
-            row = self._sure.execute(
+        with self.lock:
+            row = self.sure.execute(
                 "SELECT body, rejected, original FROM stops WHERE survey = ? AND leg = ? AND stop = ?",
                 (self.survey_id(survey), leg, stop),
             ).fetchone()
@@ -295,19 +223,66 @@ class Journal:
         self, survey: str, leg: int, stop: int, body: bytes, original: bytes | None, reason: str | None
     ) -> None:
         """Another content for a stop, to be uploaded in place of what the server has or will have got by then."""
-        with self._transaction():
-            self._sure.execute(
+        with self.transaction():
+            self.sure.execute(
                 "UPDATE stops SET replaces = digest, acknowledged = 0, body = ?, digest = ?, original = ?, "
                 "rejected = ? WHERE survey = ? AND leg = ? AND stop = ?",
                 (body, digest(body), original, reason, self.survey_id(survey), leg, stop),
             )
 
+    # ---- missions ----------------------------------------------------------------------------------------------------
+
+    def begin_mission(self, survey: str, leg: int, first_stop: int, plan: str, *, is_attended: bool) -> int:
+        """Note that a mission begins, with what must stay the same for it to be resumed; returns its number.
+
+        Raises StorageError if the disk does not take it.
+        """
+        with self.transaction():
+            self.sure.execute("UPDATE missions SET ended = 'another one began' WHERE ended IS NULL")
+            number = self.sure.execute(
+                "INSERT INTO missions (survey, leg, first_stop, is_attended, plan, state, stop, along, t, clock) "
+                "VALUES (?, ?, ?, ?, ?, 'idle', ?, 0, 0, ?)",
+                (self.survey_id(survey), leg, first_stop, is_attended, plan, first_stop, self.clock),
+            ).lastrowid
+        assert number is not None
+        return number
+
+    def note_mission(self, note: MissionNote) -> None:
+        """Note how far a mission has come; raises StorageError if the disk does not take it."""
+        with self.transaction():
+            self._update_mission(self.sure, note)
+
+    def end_mission(self, number: int, why: str) -> None:
+        """Note that a mission is over; raises StorageError if the disk does not take it."""
+        with self.transaction():
+            self.sure.execute("UPDATE missions SET ended = ? WHERE id = ?", (why, number))
+
+    def unfinished(self) -> Unfinished | None:
+        """The mission that was under way when the last daemon ended, if there was one."""
+        with self.lock:
+            row = self.sure.execute(
+                "SELECT name, leg, first_stop, is_attended, plan, missions.id, state, stop, along, missions.t, memory, "
+                "paused, boot FROM missions JOIN surveys ON surveys.id = missions.survey "
+                "LEFT JOIN clock ON clock.id = missions.clock WHERE ended IS NULL ORDER BY missions.id DESC LIMIT 1"
+            ).fetchone()
+        if row is None:
+            return None
+        survey, leg, first_stop, is_attended, plan, *note, boot = row
+        return Unfinished(survey, leg, first_stop, bool(is_attended), plan, MissionNote(*note), boot)
+
+    def _update_mission(self, connection: sqlite3.Connection, note: MissionNote) -> None:
+        connection.execute(
+            "UPDATE missions SET state = ?, stop = ?, along = ?, t = ?, clock = ?, paused = ?, "
+            "memory = coalesce(?, memory) WHERE id = ?",
+            (note.state, note.stop, note.along, note.t, self.clock, note.paused, note.memory, note.number),
+        )
+
     # ---- upload queue ------------------------------------------------------------------------------------------------
 
     def waiting(self) -> int:
         """How many records the server has not acknowledged."""
-        with self._lock:
-            (count,) = self._sure.execute(
+        with self.lock:
+            (count,) = self.sure.execute(
                 "SELECT (SELECT count(*) FROM surveys WHERE NOT acknowledged) "
                 "+ (SELECT count(*) FROM stops WHERE NOT acknowledged)"
             ).fetchone()
@@ -315,8 +290,8 @@ class Journal:
 
     def pending(self) -> list[Upload]:
         """What the server has not acknowledged, oldest first, each header before its stops."""
-        with self._lock:
-            rows = self._sure.execute(
+        with self.lock:
+            rows = self.sure.execute(
                 "SELECT id, 0, 'header', name, 0, 0, body, digest, NULL FROM surveys WHERE NOT acknowledged UNION ALL "
                 "SELECT surveys.id, stops.id, 'stop', name, leg, stop, stops.body, stops.digest, replaces "
                 "FROM stops JOIN surveys ON surveys.id = stops.survey WHERE NOT stops.acknowledged ORDER BY 1, 2"
@@ -325,13 +300,13 @@ class Journal:
 
     def acknowledge(self, upload: Upload) -> None:
         """Note that the server has this record; one that has changed since stays in the queue."""
-        with self._transaction():
+        with self.transaction():
             if upload.kind == "header":
-                self._sure.execute(
+                self.sure.execute(
                     "UPDATE surveys SET acknowledged = 1 WHERE name = ? AND digest = ?", (upload.survey, upload.digest)
                 )
             else:
-                self._sure.execute(
+                self.sure.execute(
                     "UPDATE stops SET acknowledged = 1 WHERE survey = (SELECT id FROM surveys WHERE name = ?) "
                     "AND leg = ? AND stop = ? AND digest = ?",
                     (upload.survey, upload.leg, upload.stop, upload.digest),
@@ -339,9 +314,9 @@ class Journal:
 
     def send_again(self, survey: str) -> None:
         """Put a survey's header and all its stops back into the queue, because the server has lost them."""
-        with self._transaction():
-            self._sure.execute("UPDATE surveys SET acknowledged = 0 WHERE name = ?", (survey,))
-            self._sure.execute(
+        with self.transaction():
+            self.sure.execute("UPDATE surveys SET acknowledged = 0 WHERE name = ?", (survey,))
+            self.sure.execute(
                 "UPDATE stops SET acknowledged = 0 WHERE survey = (SELECT id FROM surveys WHERE name = ?)", (survey,)
             )
 
@@ -349,33 +324,33 @@ class Journal:
 
     def note_clock(self, boot: str, t: float, utc: datetime, *, synchronised: bool) -> None:
         """Note which date a loop time was; call it at every start and whenever the date steps."""
-        with self._transaction():
-            self._clock = self._sure.execute(
+        with self.transaction():
+            self.clock = self.sure.execute(
                 "INSERT INTO clock (boot, t, utc, synchronised) VALUES (?, ?, ?, ?)",
                 (boot, t, utc.isoformat(), synchronised),
             ).lastrowid
 
     def add_slot(self, survey: str, leg: int, stop: int, slot: int, started: float, ended: float) -> None:
         """Note when a slot began and ended (loop times)."""
-        self._note(
+        row = (survey, leg, stop, slot, started, ended, self.clock)
+        statement = (
             "INSERT INTO slots (leg, stop, slot, started, ended, clock) VALUES ((SELECT max(legs.id) FROM legs "
-            "JOIN surveys ON surveys.id = legs.survey WHERE name = ? AND leg = ?), ?, ?, ?, ?, ?)",
-            [(survey, leg, stop, slot, started, ended, self._clock)],
+            "JOIN surveys ON surveys.id = legs.survey WHERE name = ? AND leg = ?), ?, ?, ?, ?, ?)"
         )
+        self.note(lambda connection: connection.execute(statement, row))
 
     def add_event(self, event: Event) -> None:
         """Keep what the operator was told."""
-        self._note(
-            "INSERT INTO events (t, source, level, text, clock) VALUES (?, ?, ?, ?, ?)",
-            [(event.t, event.source, event.level, event.text, self._clock)],
-        )
+        row = (event.t, event.source, event.level, event.text, self.clock)
+        statement = "INSERT INTO events (t, source, level, text, clock) VALUES (?, ?, ?, ?, ?)"
+        self.note(lambda connection: connection.execute(statement, row))
 
     def events(self, count: int, *, level: str = "info", after: int = 0) -> list[LoggedEvent]:
         """The newest events of at least this level, oldest first; `after`: only those with a greater number."""
         levels = ("info", "warning", "error")
         wanted = levels[levels.index(level) :]
-        with self._lock:
-            rows = self._quick.execute(
+        with self.lock:
+            rows = self.quick.execute(
                 "SELECT events.id, clock.utc, events.t - clock.t, synchronised, source, level, text FROM events "
                 "LEFT JOIN clock ON clock.id = events.clock WHERE events.id > ? "
                 f"AND level IN ({', '.join('?' * len(wanted))}) ORDER BY events.id DESC LIMIT ?",
@@ -388,75 +363,22 @@ class Journal:
 
     def trail(self, count: int) -> list[tuple[float, float, float, float]]:
         """Where the robot drove in the current leg: its newest rows of loop time, x, y, heading, oldest first."""
-        with self._lock:
-            rows = self._quick.execute(
+        with self.lock:
+            rows = self.quick.execute(
                 "SELECT t, x, y, heading FROM trail WHERE leg IS ? AND clock IS ? ORDER BY id DESC LIMIT ?",
-                (self._leg, self._clock, count),
+                (self._leg, self.clock, count),
             ).fetchall()
         return rows[::-1]
 
-    def add_trail(self, rows: Sequence[tuple[float, float, float, float]]) -> None:
-        """Keep where the robot drove in the current leg: rows of loop time, x, y, heading."""
-        self._note(
-            "INSERT INTO trail (leg, t, x, y, heading, clock) VALUES (?, ?, ?, ?, ?, ?)",
-            [(self._leg, *row, self._clock) for row in rows],
-        )
+    def add_trail(self, rows: Sequence[tuple[float, float, float, float]], note: MissionNote | None = None) -> None:
+        """Keep where the robot drove in the current leg: rows of loop time, x, y, heading; and how far it has come."""
 
-    def _note(self, statement: str, rows: Sequence[Iterable[object]]) -> None:
-        """Write rows nobody depends on: a full card must not stop the robot over them, the next stop will tell."""
-        with self._lock:
-            try:
-                self._quick.execute("BEGIN IMMEDIATE")
-                self._quick.executemany(statement, [tuple(row) for row in rows])
-                self._quick.execute("COMMIT")
-            except sqlite3.OperationalError:
-                self.dropped += len(rows)
-                _roll_back(self._quick)
-            except BaseException:
-                _roll_back(self._quick)
-                raise
+        def write(connection: sqlite3.Connection) -> None:
+            connection.executemany(
+                "INSERT INTO trail (leg, t, x, y, heading, clock) VALUES (?, ?, ?, ?, ?, ?)",
+                [(self._leg, *row, self.clock) for row in rows],
+            )
+            if note is not None:
+                self._update_mission(connection, note)
 
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        with self._lock:
-            try:
-                self._sure.execute("BEGIN IMMEDIATE")
-                yield
-                self._sure.execute("COMMIT")
-            except sqlite3.OperationalError as error:
-                _roll_back(self._sure)
-                raise MissionError(
-                    f"{self.path}: cannot be written: {error}; make room on the disk, then resume"
-                ) from error
-            except BaseException:
-                _roll_back(self._sure)
-                raise
-
-
-def _check(connection: sqlite3.Connection, path: Path) -> None:
-    """Make sure that this is a sound journal of a version we know, creating the tables in an empty file."""
-    (application,) = connection.execute("PRAGMA application_id").fetchone()
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
-    if tables and application != APPLICATION_ID:
-        raise InputError(f"{path}: an SQLite file of another program, not a journal; name another file")
-    if tables and version == 1:
-        connection.executescript(FROM_1)
-        version = 2
-    if tables and version != VERSION:
-        raise InputError(f"{path}: a journal of version {version}; this robotd knows version {VERSION}: update robotd")
-    (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
-    if verdict != "ok":
-        raise InputError(
-            f"{path}: the journal is damaged ({verdict}); move it away, 'sqlite3 {path} .recover' may rescue its stops"
-        )
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = FULL")
-    connection.execute("PRAGMA foreign_keys = ON")
-    if not tables:
-        connection.executescript(SCHEMA)
-
-
-def _roll_back(connection: sqlite3.Connection) -> None:
-    if connection.in_transaction:
-        connection.execute("ROLLBACK")
+        self.note(write, len(rows))

@@ -10,7 +10,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from .records import Stop, Survey
+from .records import MissionState, Stop, Survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +43,41 @@ class SurveySummary:
 
 @dataclass(frozen=True, slots=True)
 class StopSummary:
-    """A stop, whether the server has it, and why an operator rejected it (then it has no sightings)."""
+    """A stop, whether the server has it, why an operator rejected it (then it has no sightings), and what is doubtful
+    about it."""
 
     stop: Stop
     is_uploaded: bool
     rejected: str | None
+    flag: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MissionNote:
+    """How far mission `number` has come at time `t`: its state, the stop at which it is or to which it drives, and
+    metres along the line. `memory` is what it has learnt of the labels (JSON); None: what was noted before. `paused`
+    is why it stands still, if it is paused."""
+
+    number: int
+    state: MissionState
+    stop: int
+    along: float
+    t: float
+    memory: bytes | None = None
+    paused: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Unfinished:
+    """A mission that ended without saying so: `note` is its last one, of the boot `boot`; `leg` its first leg."""
+
+    survey: str
+    leg: int
+    first_stop: int
+    is_attended: bool
+    plan: str
+    note: MissionNote
+    boot: str | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,12 +107,15 @@ class Event:
     text: str
 
 
+MissionState = Literal["idle", "driving", "settling", "observing", "paused", "fault", "uploading", "done"]
+
+
 @dataclass(frozen=True, slots=True)
 class MissionStatus:
     """Where the mission is: `state` as drawn in ARCHITECTURE.md, stop `stop` of `stops`, and what it does in words."""
 
     t: float
-    state: Literal["idle", "driving", "settling", "observing", "uploading", "paused", "fault", "done"]
+    state: MissionState
     stop: int
     stops: int
     text: str = ""

@@ -106,7 +106,7 @@ class Operated:
     daemon : Daemon
     """
 
-    def __init__(self, folder, stops=(0.0, 1.0, 2.0), calibration=None):
+    def __init__(self, folder, stops=(0.0, 1.0, 2.0), calibration=None, **mission):
         self.folder = folder
         self.course = course = Course()
         calibration = calibration or Calibration()
@@ -116,7 +116,7 @@ class Operated:
         )
         config = Config(
             RobotConfig("trial", folder / "state", folder / "calibration.toml"),
-            MissionConfig("store", stops, ("a",), identify=QUICK),
+            MissionConfig("store", stops, **{"labels": ("a",), "identify": QUICK, "least_labels": 0, **mission}),
             recording=RecordingConfig(folder / "recordings", keep_free_mb=0.0),
             drivers={name: {"driver": name} for name in ("base", *make)},
         )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from robotd.drivers.v4l2 import V4l2Config, V4l2Driver
 
-from robotd import mission as mission_module
+from robotd import observation as observation_module
 from robotd import v4l2
 from robotd import v4l2_api as api
 from robotd.bind import bind
@@ -19,7 +19,7 @@ from robotd.daemon import _check_groups
 from robotd.errors import ConfigError, DriverFault
 from robotd.hardware import CameraMode, flicker_free, is_flicker_free
 from robotd.identify import Slot
-from robotd.mission import Health, Mission
+from robotd.observation import Observer, Site
 from robotd.plugin import Driver
 from robotd.real import RealHardware
 from robotd.records import CameraModel, Frame, Sighting, Transform
@@ -261,28 +261,24 @@ def look(config, trouble=None):
     async def main():
         bus, log = Bus(), []
         cameras = {name: Films(name, bus, log) for name in NAMES}
-        mission = Mission(
-            *(config, Calibration()),
-            **{name: Ears() for name in ("hardware", "base", "follower", "labels", "eye", "odometry", "journal")},
-            bus=bus,
-            cameras=cameras,
-            health=Health(lambda: None, lambda: None),
-            wake_upload=lambda: None,
+        observer = Observer(
+            *(config, Calibration()), bus=bus, cameras=cameras, labels=Ears(), journal=Ears(), tell=lambda text: None
         )
+        site = Site(1, 1, None, 0.0)
         seen = []
         if trouble is not None:
             trouble()
             with pytest.raises(DriverFault, match="left: no frame for 5 s; check the camera"):
-                await mission._observe(seen)
+                await observer.observe(site, seen)
             Films.fails = False
-        await mission._observe(seen)
+        await observer.observe(site, seen)
         return seen, log, {name: camera.mode for name, camera in cameras.items() if hasattr(camera, "mode")}
 
     return run_virtual(main())
 
 
 def test_all_cameras_look_at_once_unless_told_otherwise(monkeypatch):
-    monkeypatch.setattr(mission_module, "Identifier", TwoSlots)
+    monkeypatch.setattr(observation_module, "Identifier", TwoSlots)
     seen, log, modes = look(MissionConfig(mains_hz=60))
     assert [[sighting.camera for sighting in group] for group in seen] == [sorted(NAMES)]
     assert log[:4] == [(name, True) for name in NAMES]
@@ -290,7 +286,7 @@ def test_all_cameras_look_at_once_unless_told_otherwise(monkeypatch):
 
 
 def test_pairs_look_one_after_the_other_each_in_slots_of_its_own(monkeypatch):
-    monkeypatch.setattr(mission_module, "Identifier", TwoSlots)
+    monkeypatch.setattr(observation_module, "Identifier", TwoSlots)
     config = MissionConfig(camera_groups=(("front", "rear"), ("left", "right")))
     seen, log, _ = look(config)
     assert [[sighting.camera for sighting in group] for group in seen] == [["front", "rear"], ["left", "right"]]
@@ -302,7 +298,7 @@ def test_pairs_look_one_after_the_other_each_in_slots_of_its_own(monkeypatch):
 
 
 def test_a_pair_that_has_looked_does_not_look_again_when_the_other_failed(monkeypatch):
-    monkeypatch.setattr(mission_module, "Identifier", TwoSlots)
+    monkeypatch.setattr(observation_module, "Identifier", TwoSlots)
     config = MissionConfig(camera_groups=(("front", "rear"), ("left", "right")))
 
     plain = TwoSlots.finish

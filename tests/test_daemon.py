@@ -19,7 +19,7 @@ from robotd.clock import now, run_virtual
 from robotd.config import Calibration, Config, save_calibration
 from robotd.daemon import assemble, read_config
 from robotd.errors import ConfigError, DriverFault
-from robotd.mission import complete_map
+from robotd.mission_keeper import complete_map
 from robotd.plugin import Driver, available
 from robotd.records import CameraModel, Map, MappedLabel, SolverRun, Transform
 from robotd.supervisor import Supervisor

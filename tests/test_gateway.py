@@ -26,7 +26,7 @@ from robotd.config import Calibration, MissionConfig
 from robotd.errors import ConfigError, DriverFault, MissionError
 from robotd.gateway import Gateway, Outbox, main
 from robotd.identify import FlashRequest
-from robotd.mission import Health, Mission
+from robotd.observation import Observer
 from robotd.plugin import Labels
 from robotd.records import Pose
 
@@ -614,28 +614,26 @@ def test_a_refused_label_is_reported_once_and_left_out_and_all_of_them_stop_the_
             return {label: "unknown" for label in labels if label != "A2"}
 
     async def run():
-        names = ("hardware", "base", "follower", "eye", "odometry", "journal")
         bus = Bus()
-        mission = Mission(
+        observer = Observer(
             *(MissionConfig(labels=("A1", "A2")), Calibration()),
-            **{name: Anything() for name in names},
-            labels=Choosy(),
             bus=bus,
             cameras={},
-            health=Health(lambda: None, lambda: None),
-            wake_upload=lambda: None,
+            labels=Choosy(),
+            journal=None,
+            tell=print,
         )
         with bus.events.subscribe() as events:
             for _ in range(2):
-                await mission._ask(FlashRequest(("A1", "A2"), (3, 4)))
+                await observer.ask(FlashRequest(("A1", "A2"), (3, 4)))
             assert events.waiting == 1
             assert (await events.get()).text == "labels: A1 is refused and left out: unknown"
-        assert mission.refused == {"A1": "unknown"}
-        assert mission.memory.candidates(Pose(0.0, 0.0, 0.0), 0.0, []).wanted.tolist() == [False, True]
-        mission.labels.flash = lambda *arguments: asyncio.sleep(0, {"A2": "unknown"})
+        assert observer.refused == {"A1": "unknown"}
+        assert observer.memory.candidates(Pose(0.0, 0.0, 0.0), 0.0, []).wanted.tolist() == [False, True]
+        observer.labels.flash = lambda *arguments: asyncio.sleep(0, {"A2": "unknown"})
         with pytest.raises(MissionError, match="labels: every label is refused, the last one: unknown"):
-            await mission._ask(FlashRequest(("A2",), (3,)))
-        assert mission.memory.candidates(Pose(0.0, 0.0, 0.0), 0.0, []).wanted.all()  # when it goes on
+            await observer.ask(FlashRequest(("A2",), (3,)))
+        assert observer.memory.candidates(Pose(0.0, 0.0, 0.0), 0.0, []).wanted.all()  # when it goes on
 
     run_virtual(run())
 

@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robotd.errors import InputError, MissionError
+from robotd.errors import InputError, MissionError, StorageError
 from robotd.files import header_from_json, stop_from_json
 from robotd.journal import Journal
-from robotd.journal_records import digest, header_body, name_problem, stop_body
+from robotd.journal_records import MissionNote, Unfinished, digest, header_body, name_problem, stop_body
 from robotd.records import CameraModel, Event, Move, Pose, Rig, Sighting, Stop, Survey, Transform
 
 CAMERA = CameraModel(
@@ -226,7 +226,7 @@ def test_many_threads_may_write_at_once(journal):
 def test_a_full_disk_refuses_a_stop_loudly_and_notes_silently(journal):
     journal.begin_leg(HEADER)
     journal.add_stop("room", make_stop(1))
-    for connection in (journal._sure, journal._quick):
+    for connection in (journal.sure, journal.quick):
         connection.execute("PRAGMA max_page_count = 1")  # no page more than there are
     big = make_stop(2)
     big = replace(big, sightings=big.sightings * 2000)
@@ -234,7 +234,7 @@ def test_a_full_disk_refuses_a_stop_loudly_and_notes_silently(journal):
         journal.add_stop("room", big)
     journal.add_event(Event(1.0, "mission", "info", "x" * 100_000))
     assert journal.dropped == 1
-    for connection in (journal._sure, journal._quick):
+    for connection in (journal.sure, journal.quick):
         connection.execute("PRAGMA max_page_count = 100000")
     journal.add_stop("room", big)
     assert journal.last_stop("room") == big
@@ -265,9 +265,9 @@ def test_files_that_are_no_journal_are_left_alone(tmp_path):
 def test_a_journal_of_a_newer_version_is_refused(tmp_path):
     Journal.open(tmp_path / "j").close()
     with sqlite3.connect(tmp_path / "j") as connection:
-        connection.execute("PRAGMA user_version = 3")
+        connection.execute("PRAGMA user_version = 4")
     connection.close()
-    with pytest.raises(InputError, match="a journal of version 3; this robotd knows version 2: update robotd"):
+    with pytest.raises(InputError, match="a journal of version 4; this robotd knows version 3: update robotd"):
         Journal.open(tmp_path / "j")
 
 
@@ -319,20 +319,59 @@ def test_kill_9_loses_no_stop_that_was_reported(tmp_path):
         assert [stop.odometry.x for stop in stops] == [float(number) for number in range(1, len(stops) + 1)]
 
 
+# ---- missions --------------------------------------------------------------------------------------------------------
+
+
+def test_a_mission_that_nobody_ended_is_found_as_it_was_noted_last(tmp_path):
+    with Journal.open(tmp_path / "j") as journal:
+        journal.note_clock("boot-1", 1.0, datetime(2026, 11, 21, tzinfo=UTC), synchronised=True)
+        leg = journal.begin_leg(HEADER)
+        assert journal.unfinished() is None
+        number = journal.begin_mission(HEADER.survey, leg, 1, "plan", is_attended=True)
+        stop = MissionNote(number, "driving", 2, 0.1, 5.0, b"{}")
+        journal.add_stop(HEADER.survey, make_stop(1), flag="few", note=stop)
+        assert journal.stops(HEADER.survey)[0].flag == "few"
+        journal.add_trail([], MissionNote(number, "driving", 2, 0.6, 7.5))
+    with Journal.open(tmp_path / "j") as journal:
+        found = journal.unfinished()
+        assert found == Unfinished(
+            *(HEADER.survey, 1, 1, True, "plan"), MissionNote(number, "driving", 2, 0.6, 7.5, b"{}"), "boot-1"
+        )
+        journal.end_mission(number, "done")
+        assert journal.unfinished() is None
+
+
+def test_a_stop_and_how_far_the_mission_has_come_are_written_together_or_not_at_all(journal):
+    journal.begin_leg(HEADER)
+    number = journal.begin_mission(HEADER.survey, 1, 1, "", is_attended=False)
+    for connection in (journal.sure, journal.quick):
+        connection.execute("PRAGMA max_page_count = 1")
+    stop = make_stop(1)
+    big = replace(stop, sightings=stop.sightings * 2000)
+    with pytest.raises(StorageError, match="make room on the disk, then resume"):
+        journal.add_stop(HEADER.survey, big, note=MissionNote(number, "driving", 2, 1.0, 2.0))
+    found = journal.unfinished()
+    assert (found.note.stop, journal.stops(HEADER.survey)) == (1, [])
+
+
 # ---- rejected stops --------------------------------------------------------------------------------------------------
 
 
-def test_a_journal_of_the_version_before_is_taken_over_with_its_stops(tmp_path):
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_journal_of_a_version_before_is_taken_over_with_its_stops(tmp_path, version):
     with Journal.open(tmp_path / "j") as journal:
         journal.begin_leg(HEADER)
         journal.add_stop(HEADER.survey, make_stop(1))
     with sqlite3.connect(tmp_path / "j") as connection:
-        for column in ("replaces", "rejected", "original"):
+        connection.execute("DROP TABLE missions")
+        for column in ("flag", "replaces", "rejected", "original")[: 1 if version == 2 else 4]:
             connection.execute(f"ALTER TABLE stops DROP COLUMN {column}")
-        connection.execute("PRAGMA user_version = 1")
+        connection.execute(f"PRAGMA user_version = {version}")
     connection.close()
     with Journal.open(tmp_path / "j") as journal:
         assert journal.survey(HEADER.survey).stops == (make_stop(1),)
+        assert journal.unfinished() is None
+        journal.begin_mission(HEADER.survey, 1, 1, "{}", is_attended=True)
         journal.reject(HEADER.survey, 1, 1, "a person stood there")
         assert journal.stops(HEADER.survey)[0].rejected == "a person stood there"
 

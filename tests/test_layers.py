@@ -21,6 +21,7 @@ LAYERS = {
         "jpeg",
         "multipart",
         "odometry",
+        *("mission_states", "mission_guards"),
         "path_error",
         "wheel_calibration",
         "toml_edit",
@@ -36,7 +37,7 @@ LAYERS = {
     2: [
         *("clock", "link", "real", "config", "files", "bus", "hardware", "journal", "upload", "telemetry", "recording"),
         "recording_upload",
-        *("journal_records", "secret_file", "web"),
+        *("journal_file", "journal_records", "secret_file", "web"),
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "prompt", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
         "roof",
@@ -44,7 +45,7 @@ LAYERS = {
     3: ["plugin", "camera_driver", "workbench"],
     4: ["drivers"],
     5: [
-        "mission",
+        *("mission", "mission_steps", "mission_keeper", "observation"),
         "control",
         "roof_watch",
         "wheel_runs",

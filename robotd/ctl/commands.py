@@ -207,7 +207,7 @@ def stops_list(arguments: Namespace) -> int:
             stop["labels"],
             stop["sightings"],
             stop["is_uploaded"],
-            "" if stop["rejected"] is None else f"rejected: {stop['rejected']}",
+            stop["flag"] or "" if stop["rejected"] is None else f"rejected: {stop['rejected']}",
         )
         for stop in answer["stops"]
     ]

@@ -8,6 +8,7 @@ known already: phase on a grid, delays as the mean and deviation of a lognormal 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,21 @@ class DelayModel:
     def sigma(self) -> float:
         number, total, squares = self._moments
         return float(np.sqrt(max(squares / number - (total / number) ** 2, 0.05**2)))
+
+    def state(self) -> dict[str, Any]:
+        """What was learnt, for JSON; see `restore`."""
+        return {
+            "moments": self._moments.tolist(),
+            "phases": np.round(self._phases, 6).tolist(),
+            "measured": self._measured,
+        }
+
+    def restore(self, state: Mapping[str, Any], *, same_clock: bool) -> None:
+        """Take over what an earlier model had learnt; the poll's phase only if the clock has not begun anew."""
+        self._moments = np.array(state["moments"])
+        phases = np.array(state["phases"])
+        if same_clock and phases.shape == self._phases.shape:
+            self._phases, self._measured = phases, state["measured"]
 
     def quantile(self, deviations: float) -> float:
         """Delay that is so many standard deviations (of its logarithm) above the median, at most `delay_tail_s`."""

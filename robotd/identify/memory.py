@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +99,27 @@ class LabelMemory:
     def forget(self, label: str) -> None:
         """The label was taken for another one."""
         self._rays.pop(self.index[label], None)
+
+    def state(self) -> dict[str, Any]:
+        """What stays known when odometry is lost, for JSON; see `restore`."""
+        names = list(self.index)
+        return {
+            "asked": {names[k]: int(self.asked[k]) for k in np.flatnonzero(self.asked)},
+            "missed": {names[k]: int(self._missed[k]) for k in np.flatnonzero(self._missed)},
+            "learnt": sorted(self.learnt),
+            "refused": sorted(self.refused),
+            "distances": [round(distance, 2) for distance in self._distances],
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take over what an earlier memory knew of the labels that this one has."""
+        for name, counts in (("asked", self.asked), ("missed", self._missed)):
+            for label, count in state[name].items():
+                if label in self.index:
+                    counts[self.index[label]] = count
+        self.learnt |= self.index.keys() & set(state["learnt"])
+        self.refused |= self.index.keys() & set(state["refused"])
+        self._distances = list(state["distances"])
 
     @property
     def known(self) -> int:

@@ -52,7 +52,7 @@ class Rejection:
 
 def _running(operations: Operations) -> Mission:
     mission = operations.robot.mission
-    if not operations.robot.is_on_mission or mission is None or mission.is_over:
+    if mission is None or mission.is_over:
         raise RpcError(rpc.REFUSED, "no mission is under way; robotctl mission start begins one")
     return mission
 
@@ -61,9 +61,6 @@ async def _start(operations: Operations, start: Start, *, goes_on: bool) -> Any:
     robot = operations.robot
     config = robot.assembly.config.mission
     operations.check_free()
-    mission = robot.mission
-    if mission is not None and not mission.is_over:
-        raise RpcError(rpc.REFUSED, "the mission of robotd run --mission is under way")
     most = config.marker_stops if config.stop_at == "markers" else len(config.stops)
     if start.stop > most:
         raise RpcError(rpc.REFUSED, f"there is no stop {start.stop}: the mission has {most} ([mission] stops)")
@@ -77,7 +74,7 @@ async def _start(operations: Operations, start: Start, *, goes_on: bool) -> Any:
             f"survey '{survey}' has {made.stops} stops already; robotctl survey continue adds a leg to it, "
             "robotctl mission start --survey NAME begins another one",
         )
-    await robot.start_mission(survey=survey, first_stop=start.stop)
+    await robot.missions.start(survey=survey, first_stop=start.stop)
     assert robot.mission is not None
     return {"survey": survey, "leg": robot.mission.leg, "stop": start.stop, "stops": most}
 
@@ -106,9 +103,9 @@ def resume(operations: Operations, client: Client, _: Nothing) -> Any:
     """Go on; the step at which it was paused is repeated."""
     mission, control = _running(operations), operations.robot.control
     if mission.paused is None:
-        raise RpcError(
-            rpc.REFUSED, "the mission is not paused by an operator; robotctl mission status says what it does"
-        )
+        raise RpcError(rpc.REFUSED, "the mission is not paused; robotctl mission status says what it does")
+    if operations.busy is not None:
+        raise RpcError(rpc.REFUSED, f"{operations.busy} is under way; robotctl halt ends it")
     control.resume(client.who)
     if (held := control.gate.latched) is not None:
         mend = "robotctl release" if held.startswith("emergency stop") else "see to it"
@@ -231,4 +228,5 @@ def _plain_stop(item: StopSummary) -> dict[str, Any]:
         "sightings": len(stop.sightings),
         "is_uploaded": item.is_uploaded,
         "rejected": item.rejected,
+        "flag": item.flag,
     }

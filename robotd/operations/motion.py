@@ -38,10 +38,8 @@ def drive(operations: Operations, client: Client, wish: Wish) -> Any:
 
 
 def _check_mission(operations: Operations, client: Client) -> None:
-    robot, mission = operations.robot, operations.robot.mission
-    if mission is not None and not mission.is_over and mission.paused is None:
-        if not robot.is_on_mission:
-            raise RpcError(rpc.REFUSED, "the mission of robotd run --mission is under way; robotctl halt stops it")
+    mission = operations.robot.mission
+    if mission is not None and not mission.is_over:
         mission.pause(f"{client.who} drives by hand")
 
 
@@ -51,7 +49,7 @@ def halt(operations: Operations, client: Client, _: Nothing) -> Any:
     robot = operations.robot
     cause = f"stopped by {client.who}"
     operations.bus.withdrawals.publish(Withdrawal(now(), None, cause))
-    if robot.is_on_mission and robot.mission is not None and not robot.mission.is_over:
+    if robot.mission is not None and not robot.mission.is_over:
         robot.mission.pause(cause)
     return {}
 
@@ -61,7 +59,7 @@ def estop(operations: Operations, client: Client, _: Nothing) -> Any:
     """Stand still until `release`; a mission pauses."""
     robot = operations.robot
     robot.control.emergency_stop(f"by {client.who}")
-    if robot.is_on_mission and robot.mission is not None and not robot.mission.is_over:
+    if robot.mission is not None and not robot.mission.is_over:
         robot.mission.pause(f"emergency stop by {client.who}")
     return {"latched": robot.control.gate.latched}
 
@@ -85,9 +83,9 @@ def wake(operations: Operations, client: Client, _: Nothing) -> Any:
 
 @method("dock")
 async def dock(operations: Operations, client: Client, _: Nothing) -> Any:
-    """Drive onto the charger by the base's own means; a client that hangs up ends that."""
+    """Drive onto the charger by the base's own means, also in a mission's pause; a client that hangs up ends that."""
     base = cast(Base, operations.robot.assembly.base)
-    with operations.alone("docking"):
+    with operations.alone("docking", in_pause=True):
         if (held := operations.robot.control.gate.latched) is not None:
             raise RpcError(rpc.REFUSED, f"the robot is held: {held}; robotctl release first")
         try:

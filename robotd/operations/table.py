@@ -70,11 +70,13 @@ class Operations:
         """A client has hung up: it does not drive any more."""
         self.hand.gone(client)
 
-    def check_free(self) -> None:
-        """Raise RpcError if the robot is not free for something that moves it."""
+    def check_free(self, *, in_pause: bool = False) -> None:
+        """Raise RpcError if the robot is not free for something that moves it; `in_pause`: a paused mission is no
+        hindrance."""
         if self._busy is not None:
             raise RpcError(rpc.REFUSED, f"{self._busy} is under way; robotctl halt ends it")
-        if self.robot.is_on_mission:
+        mission = self.robot.mission
+        if self.robot.missions.is_under_way and not (in_pause and mission is not None and mission.paused is not None):
             raise RpcError(rpc.REFUSED, "a mission is under way; robotctl mission abort ends it")
 
     @property
@@ -83,9 +85,9 @@ class Operations:
         return self._busy
 
     @contextmanager
-    def alone(self, what: str) -> Iterator[None]:
+    def alone(self, what: str, *, in_pause: bool = False) -> Iterator[None]:
         """Have the robot for oneself inside."""
-        self.check_free()
+        self.check_free(in_pause=in_pause)
         self._busy = what
         try:
             yield
