@@ -12,7 +12,7 @@ import re
 import shutil
 import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -253,16 +253,21 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     _replace(path, "\n".join(lines) + "\n")
 
 
-def save_wheels(wheels: Wheels, path: Path) -> None:
+def save_wheels(wheels: Wheels, path: Path, note: str | None = None) -> None:
     """Write [wheels] into calibration.toml, which need not exist; all else in it, comments too, stays as it was.
 
-    Replaces the file atomically. Raises ConfigError if the file cannot be read, or its wheels cannot be edited.
+    `note` is added as a comment behind the file's other lines about wheels. Replaces the file atomically. Raises
+    ConfigError if the file cannot be read, or its wheels cannot be edited.
     """
     text = ""
     if path.exists():
         read_toml(path)
         text = path.read_text(encoding="utf-8")
     text = replace_table(text, "wheels", assignments(wheels), str(path))
+    if note is not None:
+        lines = text.splitlines()
+        header = next(k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[wheels]"))
+        text = "\n".join([*lines[: header + 1], f"# {note}", *lines[header + 1 :]]) + "\n"
     bind(Calibration, tomllib.loads(text), str(path))
     _replace(path, text)
 
@@ -328,6 +333,43 @@ def save_lens(camera: CameraModel, path: Path, priors: Priors) -> None:
             if (value := getattr(priors, name)) > getattr(before.priors, name)
         }
         text = replace_table(text, "priors", raised, str(path)) if raised else text
+    bind(Calibration, tomllib.loads(text), str(path))
+    _replace(path, text)
+
+
+def save_rig(cameras: Sequence[CameraModel], beacons: Mapping[str, Vector3], path: Path, priors: Priors) -> None:
+    """Write the cameras' poses into calibration.toml; their lenses and all else in the file stay as they were.
+
+    Parameters
+    ----------
+    cameras : sequence of CameraModel
+        One that the file lacks is added, with its lens.
+    beacons : mapping of str to (x, y, z)
+        Only those to be changed.
+    path : Path
+        Need not exist; replaced atomically.
+    priors : Priors
+        `camera_rotation_rad` and `camera_translation_m` are set to these.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or edited.
+    """
+    text, before = "", Calibration()
+    if path.exists():
+        before = load_calibration(path)
+        text = path.read_text(encoding="utf-8")
+    known = {camera.name for camera in before.cameras}
+    for camera in cameras:
+        values = assignments(camera)
+        del values["name"]
+        kept = {"T_robot_camera": values["T_robot_camera"]} if camera.name in known else values
+        text = replace_element(text, "cameras", camera.name, kept, str(path))
+    names = ("camera_rotation_rad", "camera_translation_m")
+    text = replace_table(text, "priors", {name: repr(getattr(priors, name)) for name in names}, str(path))
+    if beacons:
+        text = replace_table(text, "beacons", {name: toml(place) for name, place in beacons.items()}, str(path))
     bind(Calibration, tomllib.loads(text), str(path))
     _replace(path, text)
 

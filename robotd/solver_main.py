@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from . import workbench_tool
 from .errors import InputError, RobotdError
 from .lens_commands import add_calibrate_camera
+from .rig_commands import add_calibrate_rig
 from .roof_commands import add_calibrate_roof, add_roof
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    kinds = commands.add_parser("calibrate", help="compute a calibration from pictures").add_subparsers(
+    kinds = commands.add_parser("calibrate", help="compute a calibration from pictures or surveys").add_subparsers(
         dest="what", required=True, metavar="WHAT"
     )
     floor = kinds.add_parser(
@@ -152,6 +153,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     floor.add_argument("--json", action="store_true", help="print one JSON object")
     floor.set_defaults(run=_calibrate_floor)
     add_calibrate_camera(kinds)
+    add_calibrate_rig(kinds)
     add_calibrate_roof(kinds)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from .errors import ConfigError
 
 _HEADER = re.compile(r"\s*\[{1,2}\s*[\w\"'.\- ]+\s*\]{1,2}\s*(#.*)?$")
-_KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
+_KEY = re.compile(r"\s*\"?([A-Za-z0-9_-]+)\"?\s*=")
 
 
 def assignments(record: Any) -> dict[str, str]:

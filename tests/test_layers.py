@@ -69,6 +69,8 @@ LAYERS = {
         "roof_tool",
         "roof_commands",
         "lens_tool",
+        "rig_commands",
+        "rig_tool",
         "lens_commands",
         "calibrate",
         "doctor",

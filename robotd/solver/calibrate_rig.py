@@ -1,0 +1,475 @@
+"""Where the cameras of a rig are, from ordinary stops, though no two cameras see the same thing at the same time.
+
+Rig, labels, poses, odometry factors and beacons are adjusted together (thesis section 2.3, equations 15-17 and 43):
+what one camera saw from one stop another sees from the next, so that labels, known or not, tie the cameras to each
+other, and the moves and the floor tie them to the robot. The start is the nominal rig, which may be off by ten degrees,
+or the thesis's sphere of cameras (equation 18) where there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import InputError, SolverError
+from ..geometry.transforms import rotation_matrix, rotation_vector, transform_record
+from ..records import CameraModel, Floats, Priors, Rig, Sighting, Survey, Vector3
+from ..typed_json import many_records
+from .bundle import SQUARE
+from .problem import Problem, build_problem, stops_per_label
+from .rig_fit import Joint, Mode, joint, relative_sigma, with_nominal
+from .robust import Optimum, optimise
+
+LEAST_STOPS = 4
+LEAST_TURN = np.radians(30.0)  # of the robot between two stops, so that cameras exchange what they see
+LEAST_LABELS = 4  # of a camera, each from two stops or by another camera, too: six unknowns, and a few to check them
+LEAST_SHARED = 3  # labels that two cameras, or a camera and the tape measure, have in common
+MOST_TURN = np.radians(0.5)  # standard deviation of a camera in the rig; a map wants a tenth of it
+MOST_SHIFT = 0.015
+_FITS = 0.5  # share of sightings explained, below which the rig is not this one
+_FREE_ODOMETRY = 0.05  # relative; no worn wheel is farther off
+_ODOMETRY = 0.003  # of wheels that were calibrated, where the survey does not say
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """How far things may be from where the survey has them, as standard deviations (radians, metres).
+
+    `each` of each camera's place on the robot, `whole` of the rig's as one, `beacons` of each beacon's x and y.
+    """
+
+    each: tuple[float, float] = (float(np.radians(10.0)), 0.05)
+    whole: tuple[float, float] = (float(np.radians(0.5)), 0.003)
+    beacons: float = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraFit:
+    """One camera: what it used and how sure it is.
+
+    `rig_sigma` are standard deviations (radians, metres) of its turn and place in the rig, `robot_sigma` on the robot;
+    `moved` how far it is from nominal. `seen` (N, 2) and `left` (N, 2) px are its explained sightings and residuals.
+    """
+
+    model: CameraModel
+    rig_sigma: tuple[float, float]
+    robot_sigma: tuple[float, float]
+    moved: tuple[float, float]
+    labels: int
+    seen: Floats
+    left: Floats
+
+    @property
+    def rms_px(self) -> float:
+        """Of its residuals, per coordinate."""
+        return float(np.sqrt(np.mean(self.left**2)))
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """By what a measured quantity must be multiplied: `value` and its standard deviation; None if it does not show."""
+
+    value: float | None
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigCalibration:
+    """What a rig's calibration found.
+
+    Attributes
+    ----------
+    cameras : tuple of CameraFit
+    modes : tuple of Mode
+        The motions of the whole rig on the robot, and who knows them.
+    beacons : dict of name to position, and `beacon_sigmas` of name to the larger standard deviation of x and y
+        Only those that roof cameras saw; heights are as given.
+    beacon_distance : (metres, standard deviation) or None
+    scale, turn : Factor
+        Of odometry's distances and of its turns.
+    stops, known : int
+        Stops that took part, and known labels.
+    explained : float
+        Share of the sightings that fit.
+    notes : tuple of str
+    """
+
+    cameras: tuple[CameraFit, ...]
+    modes: tuple[Mode, ...]
+    beacons: dict[str, Vector3]
+    beacon_sigmas: dict[str, float]
+    beacon_distance: tuple[float, float] | None
+    scale: Factor
+    turn: Factor
+    stops: int
+    known: int
+    explained: float
+    notes: tuple[str, ...]
+
+
+def merge(surveys: Sequence[Survey]) -> Survey:
+    """Surveys of one shop by one robot as legs of one survey.
+
+    Raises
+    ------
+    InputError
+        If their rigs, roof cameras or known labels differ.
+    """
+    first, problems = surveys[0], []
+    stops, known = list(first.stops), {one.label: one for one in first.known_labels}
+    roofs = {roof.name: roof for roof in first.roof_cameras}
+    for survey in surveys[1:]:
+        if survey.rig != first.rig:
+            problems.append(f"surveys {first.survey} and {survey.survey} have different rigs; calibrate them apart")
+        for label in survey.known_labels:
+            if known.setdefault(label.label, label) != label:
+                problems.append(f"survey {survey.survey}: known label {label.label} is elsewhere in another survey")
+        for roof in survey.roof_cameras:
+            if roofs.setdefault(roof.name, roof) != roof:
+                problems.append(f"survey {survey.survey}: roof camera {roof.name} differs in another survey")
+        last = max((stop.leg for stop in stops), default=0)
+        default = survey.sigmas.pixel_px
+        stops += [
+            replace(stop, leg=stop.leg + last, sightings=tuple(_with_sigma(s, default) for s in stop.sightings))
+            for stop in survey.stops
+        ]
+    if problems:
+        raise InputError(*problems)
+    name = "+".join(survey.survey for survey in surveys)
+    every = tuple(known.values()), tuple(roofs.values())
+    return replace(first, survey=name, stops=tuple(stops), known_labels=every[0], roof_cameras=every[1])
+
+
+def _with_sigma(sighting: Sighting, default: float) -> Sighting:
+    return sighting if sighting.sigma_px is not None or default <= 0.0 else replace(sighting, sigma_px=default)
+
+
+def sphere(rig: Rig, headings: Mapping[str, float], radius: float, height: float) -> Rig:
+    """The thesis's sphere of cameras as a nominal rig: all look outward, level, from a circle around the robot's axis.
+
+    Parameters
+    ----------
+    rig : Rig
+        Its lenses and beacons are kept.
+    headings : mapping of camera to radians
+        Which way each looks, counter-clockwise from the robot's front.
+    radius, height : float
+        Metres.
+
+    Raises
+    ------
+    InputError
+        If a camera has no heading or a heading no camera.
+    """
+    names = [camera.name for camera in rig.cameras]
+    problems = [f"camera {name}: no heading is given" for name in names if name not in headings]
+    problems += [f"heading of '{name}': the rig has {', '.join(names)}" for name in headings if name not in names]
+    if problems:
+        raise InputError(*problems)
+    cameras = []
+    for camera in rig.cameras:
+        c, s = np.cos(headings[camera.name]), np.sin(headings[camera.name])
+        T = np.eye(4)
+        T[:3, :3] = np.array([[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]])  # columns: camera's right, down, forward
+        T[:3, 3] = radius * c, radius * s, height
+        cameras.append(replace(camera, T_robot_camera=transform_record(T)))
+    return replace(rig, cameras=tuple(cameras))
+
+
+def calibrate_rig(survey: Survey, bounds: Bounds = Bounds(), *, free: bool = True) -> RigCalibration:
+    """Estimate the cameras' poses on the robot, its beacons and its odometry's factors from a survey.
+
+    Parameters
+    ----------
+    survey : Survey
+        Its rig is the nominal one. Its priors hold for the floor and the lenses.
+    bounds : Bounds
+    free : bool
+        False leaves each camera within the survey's own priors, for who wants odometry or beacons alone.
+
+    Raises
+    ------
+    InputError
+        If the survey contradicts itself.
+    SolverError
+        If it does not determine the rig; the message says which data is missing.
+    """
+    if not free:
+        given = survey.priors
+        bounds = replace(bounds, each=(max(given.camera_rotation_rad, 1e-5), max(given.camera_translation_m, 1e-5)))
+    with many_records():
+        problem = build_problem(_loosened(survey, bounds))
+        nominal = problem.R_robot_camera, problem.t_robot_camera
+        if lacks := _missing(problem, free):
+            raise SolverError("; ".join(lacks))
+        optimum = optimise(problem)
+        if optimum.problem.frame != problem.frame:  # known labels are hard to match while cameras look elsewhere
+            found, _ = joint(optimum, bounds.beacons)
+            optimum = optimise(build_problem(_loosened(_at(survey, found), bounds)))
+        explained = _explained(optimum)
+        if explained < _FITS:
+            raise SolverError(
+                f"only {100 * explained:.0f} % of the sightings fit any rig near the given one; check which camera is "
+                "which (rig.cameras, cables), the lenses and the labels' ids, or give --sphere for a start"
+            )
+        found, optimum = joint(optimum, bounds.beacons)
+    found, modes = with_nominal(found, nominal, bounds.each, bounds.whole)
+    conflicts = tuple(
+        f"the survey puts the rig's {mode.name} {_amount(mode.name, abs(mode.change))} from where it was measured "
+        "(the measured value was not used)"
+        for mode in modes
+        if mode.contradicts
+    )
+    result = _result(problem, optimum, found, modes, nominal, bounds)
+    if free and (vague := _vague(result)):
+        raise SolverError("; ".join(vague))
+    notes = (*optimum.problem.notes, *_exchanged(found, nominal, survey.rig.cameras), *conflicts)
+    return replace(result, explained=explained, notes=notes)
+
+
+def _loosened(survey: Survey, bounds: Bounds) -> Survey:
+    """The survey with priors as wide as bounds say; the size of the map shows only against something measured."""
+    given: Priors = survey.priors
+    metric = build_problem(survey).frame != "first stop"
+    priors = replace(
+        given,
+        camera_rotation_rad=bounds.each[0],
+        camera_translation_m=bounds.each[1],
+        odometry_scale=_FREE_ODOMETRY if metric else given.odometry_scale or _ODOMETRY,
+        odometry_turn=_FREE_ODOMETRY,
+    )
+    return replace(survey, priors=priors)
+
+
+def _at(survey: Survey, found: Joint) -> Survey:
+    """The survey with another nominal rig."""
+    return replace(survey, rig=replace(survey.rig, cameras=_models(survey.rig.cameras, found)))
+
+
+def _models(cameras: Sequence[CameraModel], found: Joint) -> tuple[CameraModel, ...]:
+    poses = np.tile(np.eye(4), (len(cameras), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = found.rotation, found.translation
+    return tuple(replace(one, T_robot_camera=transform_record(T)) for one, T in zip(cameras, poses, strict=True))
+
+
+# ---- what is missing -------------------------------------------------------------------------------------------------
+
+
+def _missing(problem: Problem, free: bool) -> list[str]:
+    """What a survey lacks for a calibration, before it is tried."""
+    lacks = []
+    stops, s = problem.stop_count, problem.sightings
+    if stops < LEAST_STOPS:
+        lacks.append(f"{stops} stops are too few; make {LEAST_STOPS} or more, better 20")
+    if len(problem.cameras) == 0:
+        lacks.append("the survey's rig has no cameras")
+    turned = max(
+        (
+            float(np.abs(_wrapped(problem.odometry[f, 2] - problem.odometry[problem.leg == problem.leg[f], 2])).max())
+            for f in range(stops)
+        ),
+        default=0.0,
+    )
+    if turned < LEAST_TURN:
+        lacks.append(
+            f"the robot turned by {np.degrees(turned):.0f} degrees at most, so that no camera sees what another saw; "
+            "turn it on the spot between stops, by 90 degrees or 120, to a full circle"
+        )
+    if not free:
+        return lacks
+    known = set(problem.known.label.tolist())
+    several = stops_per_label(s.label, s.stop, len(problem.labels)) >= 2
+    useful = several | np.isin(np.arange(len(problem.labels)), problem.known.label)
+    labels = [set(s.label[(s.camera == c) & useful[s.label]].tolist()) for c in range(len(problem.cameras))]
+    names = [camera.name for camera in problem.cameras]
+    for name, mine in zip(names, labels, strict=True):
+        if len(mine) < LEAST_LABELS:
+            lacks.append(
+                f"camera {name} saw {len(mine)} labels that another stop saw, too; it needs {LEAST_LABELS} or more: "
+                "turn it towards labels at several stops"
+            )
+    group = list(range(len(labels)))
+    for a in range(len(labels)):
+        for b in range(a):
+            both_known = min(len(labels[a] & known), len(labels[b] & known)) >= LEAST_SHARED
+            if len(labels[a] & labels[b]) >= LEAST_SHARED or both_known:
+                group = [group[b] if g == group[a] else g for g in group]
+    if len(set(group)) > 1 and all(len(mine) >= LEAST_LABELS for mine in labels):
+        apart = "; ".join(
+            ", ".join(n for n, g in zip(names, group, strict=True) if g == one) for one in sorted({*group})
+        )
+        lacks.append(
+            f"cameras fall into groups that share fewer than {LEAST_SHARED} labels ({apart}); turn the robot so that "
+            "each sees what another one saw, or measure the positions of more labels"
+        )
+    return lacks
+
+
+def _wrapped(angle: Floats) -> Floats:
+    return np.asarray(np.angle(np.exp(1j * angle)))
+
+
+def _explained(optimum: Optimum) -> float:
+    problem, s = optimum.problem, optimum.problem.sightings
+    several = stops_per_label(s.label, s.stop, len(problem.labels))[s.label] >= 2
+    return float(optimum.inlier[several].mean()) if several.any() else 0.0
+
+
+def _vague(result: RigCalibration) -> list[str]:
+    """Cameras that the survey leaves too uncertain, and what would help."""
+    vague = []
+    for camera in result.cameras:
+        turn, place = camera.rig_sigma
+        if turn > MOST_TURN or place > MOST_SHIFT:
+            vague.append(
+                f"camera {camera.model.name} stays uncertain by {np.degrees(turn):.2f} degrees and {1e3 * place:.0f} "
+                f"mm with {camera.labels} labels in {len(camera.seen)} sightings; make more stops where it sees labels "
+                "that other cameras see, from 1 to 3 m and from several sides"
+            )
+    return vague
+
+
+def _exchanged(found: Joint, nominal: tuple[Floats, Floats], cameras: Sequence[CameraModel]) -> list[str]:
+    """Cameras that look where another one was said to look."""
+    look = found.rotation[:, :, 2] @ nominal[0][:, :, 2].T
+    return [
+        f"camera {cameras[c].name} looks where {cameras[other].name} was said to look: are they exchanged?"
+        for c, other in enumerate(np.argmax(look, axis=1).tolist())
+        if c != other
+    ]
+
+
+# ---- result ----------------------------------------------------------------------------------------------------------
+
+
+def _result(
+    asked: Problem,
+    optimum: Optimum,
+    found: Joint,
+    modes: tuple[Mode, ...],
+    nominal: tuple[Floats, Floats],
+    bounds: Bounds,
+) -> RigCalibration:
+    problem, s = optimum.problem, optimum.adjustment.sightings
+    residual = optimum.adjustment.residuals(optimum.state, SQUARE).residual * s.sigma[:, None]
+    turn, place = relative_sigma(found, bounds.each)
+    variance = np.diagonal(found.covariance)
+    models = _models(asked.survey.rig.cameras, found)
+    turned = np.linalg.norm(rotation_vector(found.rotation @ nominal[0].transpose(0, 2, 1)), axis=1)
+    shifted = np.linalg.norm(found.translation - nominal[1], axis=1)
+    fits = []
+    for c, model in enumerate(models):
+        mine, own = s.camera == c, variance[6 * c : 6 * c + 6]
+        fits.append(
+            CameraFit(
+                model,
+                (float(turn[c]), float(place[c])),
+                (float(np.sqrt(own[:3].max())), float(np.sqrt(own[3:].max()))),
+                (float(turned[c]), float(shifted[c])),
+                len(np.unique(s.label[mine])),
+                s.uv[mine],
+                residual[mine],
+            )
+        )
+    beacons, sigmas, distance = _beacons(problem, found, 6 * len(models) + 2)
+    scale, turns = (
+        _factor(found.odometry[k], variance[6 * len(models) + k], prior)
+        for k, prior in enumerate((asked.survey.priors.odometry_scale, asked.survey.priors.odometry_turn))
+    )
+    return RigCalibration(
+        tuple(fits),
+        modes,
+        beacons,
+        sigmas,
+        distance,
+        scale if problem.frame != "first stop" else Factor(None, asked.survey.priors.odometry_scale),
+        turns,
+        int(np.count_nonzero(optimum.placed)),
+        int(np.count_nonzero(np.isin(problem.known.label, s.label))),
+        0.0,
+        (),
+    )
+
+
+def _factor(value: float, variance: float, prior: float) -> Factor:
+    sigma = float(np.sqrt(variance))
+    return Factor(1.0 + float(value) if sigma < 0.5 * prior else None, sigma)
+
+
+def _beacons(
+    problem: Problem, found: Joint, first: int
+) -> tuple[dict[str, Vector3], dict[str, float], tuple[float, float] | None]:
+    """Those that roof cameras saw from three stops or more, and the distance between the first two."""
+    places, sigmas, rows = {}, {}, []
+    given = np.array(list(problem.survey.rig.beacons.values())).reshape(-1, 3)
+    for k, name in enumerate(problem.survey.rig.beacons):
+        seen = [b for stop in problem.survey.stops for b in stop.beacon_sightings if b.beacon == name]
+        if len(seen) < 3 or len(problem.roofs.stop) == 0:
+            continue
+        places[name] = (float(found.beacons[k, 0]), float(found.beacons[k, 1]), float(given[k, 2]))
+        own = found.covariance[first + 2 * k : first + 2 * k + 2, first + 2 * k : first + 2 * k + 2]
+        sigmas[name] = float(np.sqrt(np.linalg.eigvalsh(own)[-1]))
+        rows.append(k)
+    if len(rows) != 2:
+        return places, sigmas, None
+    apart = found.beacons[rows[0], :2] - found.beacons[rows[1], :2]
+    length = float(np.linalg.norm(apart))
+    J = np.zeros(len(found.covariance))
+    for k, sign in zip(rows, (1.0, -1.0), strict=True):
+        J[first + 2 * k : first + 2 * k + 2] = sign * apart / length
+    return places, sigmas, (length, float(np.sqrt(J @ found.covariance @ J)))
+
+
+def _amount(name: str, value: float) -> str:
+    return f"{np.degrees(value):.2f} degrees" if name in ("roll", "pitch", "yaw") else f"{1e3 * value:.1f} mm"
+
+
+def camera_to_camera(cameras: Sequence[CameraModel]) -> tuple[Floats, Floats]:
+    """Poses of all cameras in the axes of the first, rotations (C, 3, 3) and translations (C, 3): no common motion."""
+    R = rotation_matrix([camera.T_robot_camera.rotation for camera in cameras])
+    t = np.array([camera.T_robot_camera.translation for camera in cameras])
+    return R[0].T @ R, (t - t[0]) @ R[0]
+
+
+def text(result: RigCalibration) -> str:
+    """The calibration for a reader, one statement a line."""
+    sightings = sum(len(camera.seen) for camera in result.cameras)
+    lines = [
+        f"{result.stops} stops, {result.known} known labels, {sightings} sightings used "
+        f"({100 * result.explained:.0f} % of what several stops saw)"
+    ]
+    for camera in result.cameras:
+        turn, place = camera.rig_sigma
+        wide, far = camera.robot_sigma
+        lines.append(
+            f"camera {camera.model.name}: {np.degrees(camera.moved[0]):.2f} degrees and {1e3 * camera.moved[1]:.1f} mm "
+            f"from nominal; in the rig +- {np.degrees(turn):.3f} degrees, +- {1e3 * place:.2f} mm; on the robot +- "
+            f"{np.degrees(wide):.3f} degrees, +- {1e3 * far:.2f} mm; {len(camera.seen)} sightings of {camera.labels} "
+            f"labels, {camera.rms_px:.2f} px rms"
+        )
+    for mode in result.modes:
+        shown = "nothing" if np.isinf(mode.survey) else f"+- {_amount(mode.name, mode.survey)}"
+        if mode.is_shown:
+            lines.append(
+                f"whole rig, {mode.name}: moved by {_amount(mode.name, mode.change)}, +- "
+                f"{_amount(mode.name, mode.sigma)} (the survey alone: {shown})"
+            )
+        else:
+            lines.append(
+                f"whole rig, {mode.name}: not observable from this survey (it shows {shown}); kept as measured by "
+                f"tape, +- {_amount(mode.name, mode.sigma)}"
+            )
+    for name, (x, y, _) in result.beacons.items():
+        lines.append(f"beacon {name}: x {x:.4f}, y {y:.4f} m, +- {1e3 * result.beacon_sigmas[name]:.1f} mm")
+    if result.beacon_distance is not None:
+        length, sigma = result.beacon_distance
+        lines.append(f"distance of the beacons: {length:.4f} m +- {1e3 * sigma:.1f} mm")
+    for what, factor in (("distances", result.scale), ("turns", result.turn)):
+        if factor.value is None:
+            why = "measure two labels or use roof cameras" if what == "distances" else "make more turns"
+            lines.append(f"odometry's {what}: not observable from this survey; {why}")
+        else:
+            lines.append(f"odometry's {what} must be multiplied by {factor.value:.5f} +- {factor.sigma:.5f}")
+    return "\n".join([*lines, *(f"note: {note}" for note in result.notes)]) + "\n"
