@@ -89,6 +89,25 @@ class PricerDriver(Driver):
             refused.update(reply.get("refused", {}))
         return refused
 
+    async def listed(self) -> str:
+        """The label system's own list of its labels, as text; raises DriverFault if the gateway has none."""
+        pieces: list[str] = []
+        start, date = 0, None
+        while True:
+            reply = await self._ask({"method": "labels", "start": start})
+            if (cause := _cause(reply)) is not None:
+                raise self._fault(f"refuses: {cause}")
+            if date not in (None, reply.get("date")):  # it was written meanwhile: from the beginning
+                pieces, start, date = [], 0, None
+                continue
+            text, following, date = reply.get("text"), reply.get("next"), reply.get("date")
+            if not isinstance(text, str) or not (following is None or (text and following == start + len(text))):
+                raise self._fault("does not answer like robotd-labels; check host and port")
+            pieces.append(text)
+            if following is None:
+                return "".join(pieces)
+            start = following
+
     def _read_token(self) -> str | None:
         path = self.config.token_file
         if path is None:

@@ -85,6 +85,8 @@ class MissionConfig:
     keep_free_mb: float = ranged(200.0, minimum=0.0, maximum=1e6)
     least_labels: int = ranged(1, minimum=0, maximum=10000)
     if_fewer: Literal["flag", "repeat"] = "flag"
+    labels_from: Literal["config", "file", "server", "system"] = "config"
+    labels_file: Path = Path("labels.txt")
     zones: tuple[Zone, ...] = ()
 
     def __post_init__(self) -> None:
@@ -104,7 +106,9 @@ class MissionConfig:
             raise ValueError(f"labels: {', '.join(twice)} listed more than once; expected every id once")
         zoned = Counter(label for zone in self.zones for label in zone.labels)
         unknown = sorted(zoned.keys() - counts.keys())
-        if unknown:
+        if self.labels_from != "config" and self.labels:
+            raise ValueError(f"labels: expected none with labels_from = '{self.labels_from}'")
+        if unknown and self.labels_from == "config":
             raise ValueError(f"zones: {', '.join(unknown[:5])} not among labels; expected ids that are listed there")
         if not all(self.camera_groups):
             raise ValueError("camera_groups: found an empty group; expected names of cameras in each")

@@ -6,10 +6,13 @@ program runs beside it, also on Windows, as this one file. It speaks JSON over T
     {"id": 1, "token": "...", "method": "flash", "labels": ["4", "7"], "duration": [3, 5], "strength": 1.0, "key": "a"}
     {"id": 1, "ok": true, "refused": {}}           the request lies on the disk and goes into the folder, by itself
     {"id": 1, "ok": false, "error": "..."}         nothing of it will; the text says why
+    {"id": 3, "token": "...", "method": "labels", "start": 0}   {"id": 3, "ok": true, "text": "...", "next": 20000}
     {"id": 2, "token": "...", "method": "status"}  answered by {"id": 2, "ok": true, "waiting": 0, "trouble": null}
 
 `duration` is one number of seconds for all labels or a list with one for each. A label that cannot be asked is left out
 and named in `refused` with the reason; the others are asked. `trouble` is why a flash would be refused at present.
+`labels` sends the list of --labels in pieces: `next` is where the next one begins, null after the last; `date` changes
+when the file does.
 
 A request that carries a `key` (any text, unique) may be sent again after a lost connection: it is obeyed once. The
 order on the disk makes that hold through a crash: the file is written under a working name, then noted in the log with
@@ -40,6 +43,7 @@ TEMPLATE = "FLASH;{label};{duration};{strength}"
 FIELDS = ("label", "duration", "strength")
 LINE_LIMIT = 1 << 16  # bytes of one request
 LABEL_LIMIT = 500  # labels of one request
+TEXT_PIECE, TEXT_LIMIT = 20_000, 4_000_000  # characters of a list of labels, in one answer and at all
 WAITING_LIMIT = 1000  # instruction files that the label system has not fetched
 CLIENT_LIMIT = 32  # connections
 LOG_LIMIT = 4 << 20  # bytes; then the log is put aside as log.1
@@ -198,9 +202,10 @@ class Outbox:
 class Gateway:
     """Answers requests, one after the other, on any number of connections."""
 
-    def __init__(self, outbox: Outbox, token: str | None) -> None:
+    def __init__(self, outbox: Outbox, token: str | None, labels: Path | None = None) -> None:
         self.outbox = outbox
         self.token = token
+        self.labels = labels
         self.clients: set[asyncio.Task[None]] = set()
         self.held = asyncio.Event()  # a file waits for its guard time
 
@@ -290,8 +295,11 @@ class Gateway:
             _check_keys(request, set(), set())
             trouble = self.outbox.trouble()
             return {"waiting": self.outbox.waiting() if trouble is None else None, "trouble": trouble}
+        if method == "labels":
+            _check_keys(request, set(), {"start"})
+            return self._listed(request.get("start", 0))
         if method != "flash":
-            raise RefusedError(f"method: found {_quote(method)}; expected flash or status")
+            raise RefusedError(f"method: found {_quote(method)}; expected flash, labels or status")
         _check_keys(request, {"labels", "duration"}, {"strength", "key"})
         labels, strength, key = request["labels"], request.get("strength", 1.0), request.get("key")
         if not isinstance(labels, list) or not 1 <= len(labels) <= LABEL_LIMIT:
@@ -315,6 +323,22 @@ class Gateway:
                 [label for label, _ in asked], [length for _, length in asked], float(strength), key, sender, now
             )
         return {"refused": refused}
+
+    def _listed(self, start: Any) -> dict[str, Any]:
+        """A piece of the label system's own list."""
+        if self.labels is None:
+            raise RefusedError("this gateway knows no list of labels; start it with --labels FILE")
+        if not isinstance(start, int) or isinstance(start, bool) or start < 0:
+            raise RefusedError(f"start: found {_quote(start)}; expected a whole number of 0 or more")
+        try:
+            date = self.labels.stat().st_mtime_ns
+            text = self.labels.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise RefusedError(f"--labels {self.labels}: {error}") from error
+        if len(text) > TEXT_LIMIT:
+            raise RefusedError(f"--labels {self.labels}: more than {TEXT_LIMIT} characters; is that a list of labels?")
+        end = start + TEXT_PIECE
+        return {"text": text[start:end], "next": end if end < len(text) else None, "date": date}
 
     @staticmethod
     def _durations(given: Any, count: int) -> list[int]:
@@ -429,6 +453,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--token-file", type=Path, help="file with the secret that requests must carry")
     parser.add_argument("--template", default=TEMPLATE, help=f"one line of an instruction file (default: {TEMPLATE})")
     parser.add_argument("--guard", type=float, default=0.0, help="seconds between two instruction files (default: 0)")
+    parser.add_argument("--labels", type=Path, help="the label system's list of its labels, for robots that ask")
     options = parser.parse_args(arguments)
     if not 0.0 <= options.guard <= 3600.0:
         parser.error(f"--guard {options.guard:g}: expected seconds from 0 to 3600")
@@ -448,7 +473,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--template '{options.template}': {error}; expected for example '{TEMPLATE}'")
     try:
         outbox.open()
-        asyncio.run(Gateway(outbox, token).serve(options.host, options.port))
+        asyncio.run(Gateway(outbox, token, options.labels).serve(options.host, options.port))
     except OSError as error:
         print(
             f"robotd-labels: {error.filename or f'{options.host} port {options.port}'}: {error.strerror}",

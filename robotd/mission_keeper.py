@@ -17,6 +17,7 @@ from .errors import InputError, MissionError, StorageError, UploadError
 from .files import map_to_json, write_atomic
 from .hardware import flicker_free
 from .journal_records import MissionNote, Unfinished
+from .label_source import LabelSource
 from .mission import Mission, plan
 from .mission_guards import BatteryGuard, DiskGuard
 from .mission_steps import Health
@@ -141,8 +142,14 @@ class MissionKeeper:
         self._battery = BatteryGuard(limits.low_charge, limits.enough_charge, limits.low_voltage, limits.enough_voltage)
         self._disk = DiskGuard(str(daemon.state), 1e6 * limits.keep_free_mb)
         await self._look_at_disk()
+        survey = survey or config.mission.survey
+        source = LabelSource(
+            *(assembly.path.parent, daemon.state, cast(Labels, assembly.labels), daemon.uploader),
+            lambda text: self._say(text, "warning"),
+        )
+        labels = await source.labels(config.mission, survey, goes_on="interrupted" in how)
         mission = Mission(
-            replace(config.mission, identify=identify, survey=survey or config.mission.survey),
+            replace(config.mission, identify=identify, survey=survey, labels=labels, labels_from="config"),
             assembly.calibration,
             bus=assembly.bus,
             hardware=assembly.hardware,

@@ -214,7 +214,8 @@ class Steps:
 
     async def _begin_pause(self, pause: Pause, before: Pause | None) -> Pause:
         """Halt, and say why; the journal keeps what only an operator can end, for a daemon that is started again."""
-        self._halt(pause.cause)
+        if before is None:  # else it stands, or is driven by hand or docking
+            self._halt(pause.cause)
         self._tell("paused", pause.cause)
         if before is None or before.cause != pause.cause:
             self._say(f"paused: {pause.cause}", "warning")

@@ -118,6 +118,14 @@ class Labels(Protocol):
         """
 
 
+@runtime_checkable
+class ListsLabels(Protocol):
+    """A label system that knows which labels it has."""
+
+    async def listed(self) -> str:
+        """Its list of labels, as `label_list.read_labels` takes it; raises DriverFault."""
+
+
 FollowEnd = Literal["distance", "marker", "end", "told"]
 
 

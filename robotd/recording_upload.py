@@ -7,28 +7,23 @@ one question. No more than one piece is ever in memory.
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 from .clock import in_thread
-from .errors import UploadError
+from .errors import InputError, UploadError
 from .files import write_atomic
+from .sender import Report, Sender, is_final
 from .web import WebServer
 
 PIECE = 1 << 20  # bytes
-LONGEST = 64  # times retry_s: the longest pause
-PASSING = (400, 401, 403, 408, 429)  # damaged on the way, a token to be mended, "later"
-
-Report = Callable[[str, Literal["info", "warning", "error"]], None]
 
 
-class RecordingUploader:
+class RecordingUploader(Sender):
     """Sends the finished recordings of a folder, oldest name first.
 
     Parameters
@@ -55,61 +50,27 @@ class RecordingUploader:
         delete: bool,
         report: Report,
     ) -> None:
+        super().__init__("recordings", server.url, retry_s, report)
         self.directory = directory
         self.server = server
-        self.url = server.url
-        self.retry_s = retry_s
         self.timeout_s = timeout_s
         self.delete = delete
-        self.report = report
-        self._wake = asyncio.Event()
-        self._wake.set()
-        self._empty = asyncio.Event()
         self._refused: set[str] = set()
-        self._trouble: str | None = None
 
-    def wake(self) -> None:
-        """Say that there is a new recording."""
-        self._empty.clear()
-        self._wake.set()
-
-    async def wait_empty(self) -> None:
-        """Wait until the server has, or has refused, every recording there was at the last `wake`."""
-        await self._empty.wait()
-
-    async def run(self) -> None:
-        """Send until cancelled."""
-        pause = self.retry_s
-        while True:
-            await self._wake.wait()
-            self._wake.clear()
+    async def _send_all(self) -> float | None:
+        for path in await in_thread(self._waiting):
             try:
-                for path in await in_thread(self._waiting):
-                    await self._offer(path)
+                await self._send(path)
             except UploadError as error:
-                if str(error) != self._trouble:
-                    self.report(f"{error}; recordings are kept and sent again", "warning")
-                self._trouble = str(error)
-                self._wake.set()
-                await asyncio.sleep(pause)
-                pause = min(2.0 * pause, LONGEST * self.retry_s)
-            else:
-                pause, self._trouble = self.retry_s, None
-                if not self._wake.is_set():
-                    self._empty.set()
+                if not error.permanent:
+                    return self._failed(str(error))
+                self._refused.add(path.stem)  # until the next start
+                self.report(f"{path.name} is refused and stays on the robot: {error}", "error")
+        return None
 
     def _waiting(self) -> list[Path]:
         files = sorted(self.directory.glob("*.mcap")) if self.directory.is_dir() else []
         return [path for path in files if path.stem not in self._refused and not uploaded_mark(path).exists()]
-
-    async def _offer(self, path: Path) -> None:
-        try:
-            await self._send(path)
-        except UploadError as error:
-            if not error.permanent:
-                raise
-            self._refused.add(path.stem)  # until the next start
-            self.report(f"{path.name} is refused and stays on the robot: {error}", "error")
 
     async def _send(self, path: Path) -> None:
         """Bring one recording to the server; raises UploadError."""
@@ -121,7 +82,10 @@ class RecordingUploader:
         at, complete = await self._exchange("GET", f"{target}?size={size}&sha256={digest.hex()}")
         while not complete:
             before = at
-            body = await in_thread(_read, path, at)
+            try:
+                body = await in_thread(_read, path, at)
+            except OSError as error:
+                raise UploadError(f"{path}: cannot be read: {error.strerror or error}", permanent=True) from error
             if not body and size:
                 raise UploadError(f"{path}: has become shorter while it was sent", permanent=True)
             headers = {
@@ -133,10 +97,11 @@ class RecordingUploader:
             at, complete = await self._exchange("PUT", target, body=body, headers=headers)
             if at <= before and not complete:
                 raise UploadError(f"{self.url} has lost a part of {path.name}, it gets that again")
-            if self._trouble is not None:
-                self._trouble = None
-                self.report(f"{self.url} takes recordings again", "info")
-        await in_thread(_settle, path, self.url, digest, delete=self.delete)
+            self._succeeded()
+        try:
+            await in_thread(_settle, path, self.url, digest, delete=self.delete)
+        except (InputError, OSError) as error:
+            raise UploadError(f"{path.name} is on the server, which cannot be noted: {error}") from error
         self.report(f"{path.name} is on the server ({size / 1e6:.1f} MB)", "info")
 
     async def _exchange(self, method: str, target: str, **more: Any) -> tuple[int, bool]:
@@ -153,7 +118,7 @@ class RecordingUploader:
         why = "; ".join(map(str, problems)) if isinstance(problems, list) else "not as a robotd-solver does"
         raise UploadError(
             f"{self.url} answers {status}: {why}",
-            permanent=problems is not None and 400 <= status < 500 and status not in PASSING,
+            permanent=problems is not None and is_final(status),
         )
 
 

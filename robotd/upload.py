@@ -8,30 +8,26 @@ while the others go on.
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import json
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 from .clock import in_thread, now
-from .errors import InputError, UploadError
+from .errors import InputError, StorageError, UploadError
 from .files import map_from_json
 from .journal import Journal
 from .journal_records import Upload
 from .records import Map
+from .sender import LONGEST, Report, Sender, is_final
 from .web import WebServer
 
-LONGEST = 64  # times retry_s: the longest pause, and the pause between offers of a refused record
-PASSING = (400, 401, 403, 408, 429)  # damaged on the way, a token to be mended on either side, "later"
 SOLVING_S = 600.0  # s, a map of a large store takes minutes
+LABELS_LIMIT = 4 << 20  # bytes of a list of labels
 MAP_LIMIT = 32 << 20  # bytes; a map of 10 000 labels, each seen ten times, has 15 million
 
-Report = Callable[[str, Literal["info", "warning", "error"]], None]
 
-
-class Uploader:
+class Uploader(Sender):
     """Sends what waits in the journal.
 
     Parameters
@@ -48,44 +44,11 @@ class Uploader:
     """
 
     def __init__(self, journal: Journal, server: WebServer, retry_s: float, timeout_s: float, report: Report) -> None:
+        super().__init__("records", server.url, retry_s, report)
         self.journal = journal
         self.server = server
-        self.url = server.url
-        self.retry_s = retry_s
         self.timeout_s = timeout_s
-        self.report = report
-        self._wake = asyncio.Event()
-        self._empty = asyncio.Event()
-        self._factor = 1
-        self._trouble: str | None = None
         self._refused: dict[str, float] = {}  # digest -> loop time from which on to offer it again
-
-    @property
-    def trouble(self) -> str | None:
-        """Why nothing can be sent now, in words."""
-        return self._trouble
-
-    def wake(self) -> None:
-        """Say that new records wait in the journal."""
-        self._empty.clear()
-        self._wake.set()
-
-    async def wait_empty(self) -> None:
-        """Wait until the server has everything that was in the journal at the last `wake`."""
-        await self._empty.wait()
-
-    async def run(self) -> None:
-        """Send until cancelled."""
-        while True:
-            self._wake.clear()
-            pause = await self._send_all()
-            if pause is None and not self._wake.is_set():
-                self._empty.set()
-            try:
-                async with asyncio.timeout(pause):
-                    await self._wake.wait()
-            except TimeoutError:
-                pass
 
     async def fetch_map(self, survey: str) -> Map:
         """The server's map of a survey; waits while it is being solved.
@@ -102,10 +65,13 @@ class Uploader:
         except InputError as error:
             raise UploadError(str(error), permanent=True) from error
 
+    async def fetch_labels(self, survey: str) -> bytes:
+        """The server's list of labels for a survey, see `label_list`; raises UploadError."""
+        return await self._exchange("GET", f"{_target(survey)}/labels", limit=LABELS_LIMIT)
+
     # ---- one round ---------------------------------------------------------------------------------------------------
 
     async def _send_all(self) -> float | None:
-        """Offer everything once; returns seconds until the next try is due, None if nothing is left."""
         due: list[float] = []
         held: set[str] = set()  # surveys whose header the server refuses: their stops wait behind it
         for upload in await in_thread(self.journal.pending):
@@ -119,6 +85,9 @@ class Uploader:
                 continue
             try:
                 await self._send(upload)
+                await in_thread(self.journal.acknowledge, upload)
+            except StorageError as error:  # the server has it, and says so again when there is room to note that
+                return self._failed(str(error))
             except UploadError as error:
                 if not error.permanent:
                     return self._failed(str(error))
@@ -129,24 +98,9 @@ class Uploader:
                 if upload.kind == "header":
                     held.add(upload.survey)
             else:
-                await in_thread(self.journal.acknowledge, upload)
                 self._refused.pop(upload.digest, None)
                 self._succeeded()
         return max(self.retry_s, min(due) - now()) if due else None
-
-    def _failed(self, trouble: str) -> float:
-        pause = self.retry_s * self._factor
-        self._factor = min(2 * self._factor, LONGEST)
-        if trouble != self._trouble:
-            self.report(f"{trouble}; records are kept and sent again", "warning")
-        self._trouble = trouble
-        return pause
-
-    def _succeeded(self) -> None:
-        if self._trouble is not None:
-            self.report(f"{self.url} takes records again", "info")
-        self._trouble = None
-        self._factor = 1
 
     async def _send(self, upload: Upload) -> None:
         target = _target(upload.survey)
@@ -180,7 +134,7 @@ class Uploader:
         text = f"{self.url} answers {status}: {_reason(answer)}"
         if status == 404:
             raise _MissingError(text, permanent=True)
-        raise UploadError(text, permanent=400 <= status < 500 and status not in PASSING)
+        raise UploadError(text, permanent=is_final(status))
 
 
 class _MissingError(UploadError):

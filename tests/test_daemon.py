@@ -51,6 +51,7 @@ def test_the_example_explains_every_key_and_its_comments_show_the_defaults():
                     "url",
                     "token_file",
                     "token_credential",
+                    "ca_file",
                     "known_labels",
                     "zones",
                     "wake_pin",

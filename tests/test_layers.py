@@ -36,7 +36,7 @@ LAYERS = {
     ],
     2: [
         *("clock", "link", "real", "config", "files", "bus", "hardware", "journal", "upload", "telemetry", "recording"),
-        "recording_upload",
+        *("recording_upload", "sender", "label_list"),
         *("journal_file", "journal_records", "secret_file", "web"),
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "prompt", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
@@ -45,7 +45,7 @@ LAYERS = {
     3: ["plugin", "camera_driver", "workbench"],
     4: ["drivers"],
     5: [
-        *("mission", "mission_steps", "mission_keeper", "observation"),
+        *("mission", "mission_steps", "mission_keeper", "observation", "label_source"),
         "control",
         "roof_watch",
         "wheel_runs",

@@ -5,6 +5,7 @@
     GET /api/surveys                                  names and numbers of stops
     GET /api/surveys/{survey}                         robotd-survey/1
     GET /api/surveys/{survey}/map                     robotd-map/1 of all stops; solving begins when a stop comes
+    GET /api/surveys/{survey}/labels                  the labels to look for, one id a line, as the operator wrote them
     GET /api/recordings                               names, sizes and hashes of the complete ones
     GET /api/recordings/{name}                        {"received": bytes, "complete": bool}
     PUT /api/recordings/{name}                        a piece, see below
@@ -115,6 +116,10 @@ def create_app(
     @api.get("/surveys/{survey}/map")
     async def get_map(survey: str) -> Response:
         return Response(await maps.map(survey), media_type="application/json")
+
+    @api.get("/surveys/{survey}/labels")
+    async def get_labels(survey: str) -> Response:
+        return Response(await asyncio.to_thread(store.labels, survey), media_type="text/plain")
 
     if recordings is not None:
         _add_recordings(api, recordings)

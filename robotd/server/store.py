@@ -3,6 +3,7 @@
     <data>/surveys/<name>/header.json       the robot's bytes, as they came
     <data>/surveys/<name>/stop-1-3.json     leg 1, stop 3, as it came
     <data>/surveys/<name>/map-<revision>.json
+    <data>/labels/<name>.txt, <data>/labels.txt   the labels to look for, if robots ask; written by the operator
 
 A record is on the disk before it is acknowledged. The same record again is welcome; another content for a record that
 exists is refused, because somebody has already acted on the first one.
@@ -129,6 +130,23 @@ class Store:
     def notes(self, name: str) -> tuple[str, ...]:
         """What the roof cameras' part of a survey gives reason to tell the operator; raises as `survey`."""
         return self._whole(name)[1]
+
+    def labels(self, name: str) -> bytes:
+        """The labels that a robot shall look for: <data>/labels/<name>.txt, or <data>/labels.txt for all surveys.
+
+        Raises
+        ------
+        UnknownSurveyError
+            If there is neither.
+        StoreError
+            If it cannot be read.
+        """
+        own = self._data / "labels" / f"{self._of(name).name}.txt"
+        every = self._data / "labels.txt"
+        found = _read(own) or _read(every)
+        if found is None:
+            raise UnknownSurveyError(f"survey {name!r}: no list of labels; write one id a line into {own} or {every}")
+        return found
 
     def roof_status(self) -> bytes:
         """What `robotd-solver roof watch` said last, JSON; {} if it never ran here."""
