@@ -78,7 +78,7 @@ def test_a_flash_becomes_one_instruction_file(desk, tmp_path):
         ({"token": "wrong"}, "token: missing or wrong"),
         ({"token": None}, "token: missing or wrong"),
         ({"token": "\ud800"}, "token: missing or wrong"),
-        ({"method": "glow"}, 'method: found "glow"; expected flash or status'),
+        ({"method": "glow"}, 'method: found "glow"; expected flash, labels or status'),
         ({"method": None}, "method: found null"),
         ({"id": [1]}, "id: expected a number or a text"),
         ({"labels": []}, "labels: expected a list of 1 to 500"),
