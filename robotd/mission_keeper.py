@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 from .clock import in_thread, now, ticks
+from .config import MissionConfig
 from .errors import InputError, MissionError, StorageError, UploadError
 from .files import map_to_json, write_atomic
 from .hardware import flicker_free
@@ -127,29 +128,51 @@ class MissionKeeper:
         self._noted = note.t
         return note
 
+    async def config(self, survey: str, *, goes_on: bool = False, everywhere: bool = False) -> MissionConfig:
+        """The configuration of a survey, with the labels that its source names and what pictures are calibrated to.
+
+        Parameters
+        ----------
+        survey : str
+        goes_on : bool
+            With an interrupted mission.
+        everywhere : bool
+            Without zones, which hold for places along the line only.
+
+        Raises
+        ------
+        InputError, MissionError
+            See `LabelSource.labels`.
+        """
+        daemon, assembly = self.daemon, self.daemon.assembly
+        mission = assembly.config.mission
+        if everywhere:
+            mission = replace(mission, zones=())
+        identify = replace(
+            mission.identify,
+            gamma=assembly.calibration.gamma,
+            row_time_s=assembly.calibration.row_time_s,
+            exposure_s=flicker_free(mission.identify.exposure_s, mission.mains_hz),
+        )
+        source = LabelSource(
+            *(assembly.path.parent, daemon.state, cast(Labels, assembly.labels), daemon.uploader),
+            lambda text: self._say(text, "warning"),
+        )
+        labels = await source.labels(mission, survey, goes_on=goes_on)
+        return replace(mission, identify=identify, survey=survey, labels=labels, labels_from="config")
+
     # ---- one mission -------------------------------------------------------------------------------------------------
 
     async def _begin(self, survey: str | None, **how: Any) -> None:
         daemon = self.daemon
         assembly, config = daemon.assembly, daemon.assembly.config
-        identify = replace(
-            config.mission.identify,
-            gamma=assembly.calibration.gamma,
-            row_time_s=assembly.calibration.row_time_s,
-            exposure_s=flicker_free(config.mission.identify.exposure_s, config.mission.mains_hz),
-        )
         limits = config.mission
         self._battery = BatteryGuard(limits.low_charge, limits.enough_charge, limits.low_voltage, limits.enough_voltage)
         self._disk = DiskGuard(str(daemon.state), 1e6 * limits.keep_free_mb)
         await self._look_at_disk()
         survey = survey or config.mission.survey
-        source = LabelSource(
-            *(assembly.path.parent, daemon.state, cast(Labels, assembly.labels), daemon.uploader),
-            lambda text: self._say(text, "warning"),
-        )
-        labels = await source.labels(config.mission, survey, goes_on="interrupted" in how)
         mission = Mission(
-            replace(config.mission, identify=identify, survey=survey, labels=labels, labels_from="config"),
+            await self.config(survey, goes_on="interrupted" in how),
             assembly.calibration,
             bus=assembly.bus,
             hardware=assembly.hardware,

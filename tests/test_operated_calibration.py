@@ -2,15 +2,17 @@
 
 import asyncio
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from robotd.clock import now
+from robotd.config import Calibration
 from robotd.recording import read_frames
-from robotd.records import Frame
-from tests.operated import operated
+from robotd.records import CameraModel, Frame, Transform
+from tests.operated import QUICK, operated
 
 
 async def converse(client, answers=lambda prompt: None, **params):
@@ -62,6 +64,45 @@ def test_a_picture_without_the_board_is_asked_for_again(tmp_path):
         assert "no cameras of the rig" in (await converse(client, what="rig"))[0]["message"]
 
     operated(tmp_path, scenario)
+
+
+def test_the_rig_gets_a_survey_of_turns_on_the_spot_at_places_driven_or_carried_to(tmp_path):
+    level = Transform((-np.pi / 2, 0.0, 0.0), (0.06, 0.0, 0.5))
+    calibration = Calibration(cameras=(CameraModel("eye", (64, 48), (30.0, 30.0, 31.5, 23.5), level),))
+
+    async def scenario(robot, client):
+        robot.daemon.assembly.cameras["eye"] = robot.eye
+        metres = iter([0.3, 0.0])
+
+        def answers(prompt):
+            return next(metres) if prompt["kind"] == "measure" else None
+
+        result, prompts = await converse(client, answers, what="rig", places=3, headings=2)
+        name = result["survey"]
+        assert name == "rig-20260302T000000Z"
+        assert f"robotd-solver calibrate rig {name}.json" in result["text"]
+        assert [prompt["kind"] for prompt in prompts if prompt["kind"] != "tell"] == [
+            "ready",
+            "measure",
+            "measure",
+            "ready",
+        ]
+        made = await client.call("survey.export", survey=name)
+        assert [(stop["leg"], stop["stop"]) for stop in made["stops"]] == [
+            *((1, k) for k in range(1, 7)),
+            *((2, k) for k in range(7, 10)),
+        ]
+        ahead, turned, on = (made["stops"][k]["move"] for k in (1, 2, 3))
+        assert ahead["dx"] == pytest.approx(0.15, abs=0.03)
+        assert ahead["dheading"] == pytest.approx(0.0, abs=0.03)
+        assert turned["dx"] == pytest.approx(0.0, abs=0.01)
+        assert abs(turned["dheading"]) == pytest.approx(np.pi, abs=0.15)
+        assert abs(on["dheading"]) == pytest.approx(np.pi, abs=0.3)
+        assert np.hypot(on["dx"], on["dy"]) == pytest.approx(0.3, abs=0.05)
+        assert made["stops"][6]["move"] is None
+        assert robot.labels.asked
+
+    operated(tmp_path, scenario, calibration=calibration, identify=replace(QUICK, max_slots=1))
 
 
 def test_the_time_offset_gets_frames_and_odometry_of_a_robot_that_swings(tmp_path):

@@ -32,7 +32,7 @@ def floor(arguments: Namespace) -> int:
 
 def rig(arguments: Namespace) -> int:
     """Where the cameras of the rig are."""
-    return _run(arguments, "rig", **_board(arguments))
+    return _run(arguments, "rig", places=arguments.places, headings=arguments.headings)
 
 
 def flash(arguments: Namespace) -> int:

@@ -127,9 +127,12 @@ COMMANDS: dict[str, tuple[str, str, list[Option]]] = {
         [COUNT, *BOARD],
     ),
     "calibrate rig": (
-        "pictures of a chessboard by all cameras while the robot turns",
+        "a survey with turns on the spot at some places, for where the cameras are",
         "calibrate.rig",
-        [COUNT, *BOARD],
+        [
+            (("--places",), {"type": int, "default": 5, "metavar": "N", "help": "default: 5"}),
+            (("--headings",), {"type": int, "default": 3, "metavar": "N", "help": "at each place (default: 3)"}),
+        ],
     ),
     "calibrate flash": (
         "how a label flashes: a recording of one that does",

@@ -1,7 +1,8 @@
 """Collecting what calibrations need, with a person beside the robot who is prompted over the control socket.
 
-Odometry is computed and written here. All else goes into a folder of its own in <state>/calibration, with a file
-`data.json` (robotd-calibration-data/1, see ARCHITECTURE.md) that says what is in it; `robotd-solver` computes from it.
+Odometry is computed and written here, and what the rig needs is a survey. All else goes into a folder of its own in
+<state>/calibration, with a file `data.json` (robotd-calibration-data/1, see ARCHITECTURE.md) that says what is in it;
+`robotd-solver` computes from it.
 """
 
 from __future__ import annotations
@@ -26,18 +27,17 @@ from ..errors import DriverFault, InputError, MissionError
 from ..hardware import CameraMode
 from ..plugin import Camera, Labels
 from ..recording import read_frames
-from ..records import DriveCommand, Frame, OdometryState, Withdrawal
+from ..records import Frame, OdometryState, Withdrawal
 from ..rpc import RpcError
 from ..vision.learn_pattern import LearntPattern, learn_pattern
 from ..wheel_calibration import calibrate, summary
 from ..wheel_runs import SOURCE, RunPlan, check_writable, collect
+from .rig_survey import collect_rig
+from .spot_moves import turn
 from .table import Operations, method
 
 FORMAT = "robotd-calibration-data/1"
-TURN_RATE = 0.5  # rad/s
-SETTLE_S = 0.8
 FRAME_S = 5.0
-STUCK_S = 3.0
 ATTEMPTS = 5  # at a picture that shows no board
 SWING = math.radians(40.0)  # to either side, for the time offset
 
@@ -49,6 +49,8 @@ class Calibration:
     what: Literal["odometry", "camera", "floor", "rig", "flash", "time"]
     camera: str | None = None
     label: str | None = None
+    places: int = ranged(5, minimum=1, maximum=50)
+    headings: int = ranged(3, minimum=2, maximum=12)
     pictures: int = ranged(12, minimum=1, maximum=200)
     columns: int = ranged(9, minimum=3, maximum=50)
     rows: int = ranged(6, minimum=3, maximum=50)
@@ -150,7 +152,7 @@ class _Album:
             "created": utc.isoformat(timespec="seconds").replace("+00:00", "Z"),
             **about,
         }
-        if wanted.what in ("camera", "floor", "rig"):
+        if wanted.what in ("camera", "floor"):
             self.data["board"] = {"columns": wanted.columns, "rows": wanted.rows, "square_m": wanted.square}
             self.data["pictures"] = []
         self._size = wanted.columns, wanted.rows
@@ -255,30 +257,7 @@ async def _floor(operations: Operations, person: _Person, wanted: Calibration) -
 
 
 async def _rig(operations: Operations, person: _Person, wanted: Calibration) -> Any:
-    """All cameras of the rig at once, again and again while the robot turns on the spot."""
-    cameras = [cast(Camera, camera) for camera in operations.robot.assembly.cameras.values()]
-    if not cameras:
-        raise InputError("the calibration names no cameras of the rig; calibrate each camera's lens first")
-    album = _Album(operations, wanted, cameras=[camera.name for camera in cameras])
-    await person.ready(
-        "Set up one chessboard or more, upright, 0.5 to 1.5 m from the robot, so that all cameras see one in the "
-        f"course of a turn. The robot turns once on the spot, in {wanted.pictures} steps; stay clear of it."
-    )
-    good = 0
-    for camera in cameras:
-        await camera.start(_mode(operations, camera))
-    try:
-        for step in range(wanted.pictures):
-            if step:
-                await _turn(operations, 2.0 * math.pi / wanted.pictures)
-            await asyncio.sleep(SETTLE_S)
-            for camera in cameras:
-                good += await album.add(await _photograph(operations, camera), operations.bus.odometry.latest)
-            await person.tell(f"{step + 1} of {wanted.pictures}: {good} pictures show a board")
-    finally:
-        for camera in cameras:
-            await camera.stop()
-    return await album.finish(f"{good} pictures of boards in {{folder}}")
+    return await collect_rig(operations, person, wanted.places, wanted.headings)
 
 
 # ---- recordings ------------------------------------------------------------------------------------------------------
@@ -358,10 +337,10 @@ async def _time(operations: Operations, person: _Person, wanted: Calibration) ->
     following = asyncio.create_task(follow())
     try:
         end = now() + wanted.seconds
-        await _turn(operations, 0.5 * SWING)
+        await turn(operations, 0.5 * SWING)
         side = -1.0
         while now() < end:
-            await _turn(operations, side * SWING)
+            await turn(operations, side * SWING)
             side = -side
     finally:
         following.cancel()
@@ -373,25 +352,3 @@ async def _time(operations: Operations, person: _Person, wanted: Calibration) ->
         "rows": [(state.t, state.pose.heading, state.turn_rate) for state in rows],
     }
     return await album.finish(f"recorded {status['file']}; odometry in {{folder}}/data.json")
-
-
-async def _turn(operations: Operations, angle: float) -> None:
-    """Turn on the spot; raises MissionError when something holds the robot."""
-    control, bus = operations.robot.control, operations.bus
-    turned, moved = 0.0, now()
-    with bus.odometry.subscribe(size=2) as states:
-        async with asyncio.timeout(FRAME_S):
-            before = (await states.get()).pose.heading
-        while abs(turned) < abs(angle):
-            bus.commands.publish(DriveCommand(now(), 0.0, math.copysign(TURN_RATE, angle), SOURCE))
-            try:
-                async with asyncio.timeout(1.0):
-                    state = await states.get()
-            except TimeoutError:
-                raise DriverFault("the base sends no sensor frames") from None
-            step = math.remainder(state.pose.heading - before, 2.0 * math.pi)
-            turned, before = turned + step, state.pose.heading
-            moved = state.t if step else moved
-            if (held := control.gate.latched) is not None or now() - moved > STUCK_S:
-                raise MissionError(f"the robot was stopped: {held or control.cause or 'it does not turn'}")
-        bus.commands.publish(DriveCommand(now(), 0.0, 0.0, SOURCE))

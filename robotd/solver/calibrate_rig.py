@@ -205,7 +205,8 @@ def calibrate_rig(survey: Survey, bounds: Bounds = Bounds(), *, free: bool = Tru
         if lacks := _missing(problem, free):
             raise SolverError("; ".join(lacks))
         optimum = optimise(problem)
-        if optimum.problem.frame != problem.frame:  # known labels are hard to match while cameras look elsewhere
+        if optimum.problem.frame != problem.frame or not optimum.placed.all():
+            # known labels are hard to match, and legs to join, while cameras look elsewhere than they are thought to
             found, _ = joint(optimum, bounds.beacons)
             optimum = optimise(build_problem(_loosened(_at(survey, found), bounds)))
         explained = _explained(optimum)
@@ -225,7 +226,7 @@ def calibrate_rig(survey: Survey, bounds: Bounds = Bounds(), *, free: bool = Tru
     result = _result(problem, optimum, found, modes, nominal, bounds)
     if free and (vague := _vague(result)):
         raise SolverError("; ".join(vague))
-    notes = (*optimum.problem.notes, *_exchanged(found, nominal, survey.rig.cameras), *conflicts)
+    notes = (*optimum.problem.notes, *_left_out(optimum), *_exchanged(found, nominal, survey.rig.cameras), *conflicts)
     return replace(result, explained=explained, notes=notes)
 
 
@@ -329,6 +330,17 @@ def _vague(result: RigCalibration) -> list[str]:
                 "that other cameras see, from 1 to 3 m and from several sides"
             )
     return vague
+
+
+def _left_out(optimum: Optimum) -> list[str]:
+    """Stops that could not be joined to the others."""
+    lost = [f"{s.leg}/{s.stop}" for s, ok in zip(optimum.problem.survey.stops, optimum.placed, strict=True) if not ok]
+    if not lost:
+        return []
+    return [
+        f"leg/stop {', '.join(lost)} share too few labels with the rest and were not used; carry the robot only to "
+        "places from which it sees labels that it has seen"
+    ]
 
 
 def _exchanged(found: Joint, nominal: tuple[Floats, Floats], cameras: Sequence[CameraModel]) -> list[str]:
