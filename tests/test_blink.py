@@ -206,6 +206,16 @@ def test_the_spot_fit_scatters_as_its_covariance_says():
     assert expected == pytest.approx(np.sqrt(2.0 / np.pi) / 10.0, rel=0.15)  # the Cramer-Rao bound of a Gaussian spot
 
 
+def test_a_narrow_spot_within_two_by_two_cells_has_a_place():
+    places = np.arange(16.0)
+    cells = np.outer(*(np.exp(-0.5 * ((places - c) / 0.7) ** 2).reshape(8, 2).mean(axis=1) for c in (7.6, 7.9))) * 30.0
+    image = cells + np.random.default_rng(2).normal(0.0, 0.1, cells.shape)
+    spot = fit_spot(image, np.full(cells.shape, 0.01), np.ones(cells.shape, bool), pitch=2)
+    assert spot is not None
+    assert (spot.u, spot.v) == pytest.approx((7.9, 7.6), abs=0.15)
+    assert spot.sigma < 0.1
+
+
 def test_no_spot_is_fitted_to_noise_or_to_an_edge():
     rng = np.random.default_rng(2)
     assert (

@@ -11,6 +11,7 @@ from robotd.vision.blink import FlashConfig, FlashDetector, FlashPattern
 from robotd.vision.learn_pattern import learn_pattern, learn_trace
 from robotd.vision.matching import Matcher
 from robotd.vision.mirror import Lamp, reflected
+from robotd.vision.pattern import Look
 from robotd.vision.shake import Shake, kernels
 from robotd.vision.thesis_blink import ThesisFlashConfig, ThesisFlashDetector, cost, periods_of
 from robotd.workbench.score import Score
@@ -132,10 +133,15 @@ def test_the_cost_is_zero_on_a_period_and_limited_elsewhere():
     assert np.allclose(cost(np.array([0.2, 0.6, 1.0, 5.0, 0.1]), (0.2, 0.6, 1.0)), [0.0, 0.0, 0.0, 1.0, 1.0])
 
 
+def look(start, sigma, t=1.0):
+    away = 0.0015 * np.arange(-40, 41)
+    return Look(t, start + away[0], 0.0015, -0.5 * (away / sigma) ** 2)
+
+
 def lamps_of(*looks):
     """Lights in a slanted row."""
     return [
-        Lamp(np.array([[1.0, start, 0.003]]), peak, width, 100.0 + 60.0 * k, 100.0 + 40.0 * k)
+        Lamp([look(start, 0.003)], peak, width, 100.0 + 60.0 * k, 100.0 + 40.0 * k)
         for k, (start, peak, width) in enumerate(looks)
     ]
 
@@ -147,10 +153,10 @@ def test_a_dim_and_blurred_light_of_the_same_phase_is_a_reflection():
 
 
 def test_a_chance_match_far_off_is_no_reflection_and_one_straight_below_is():
-    looks = np.array([[1.0, 0.75, 0.006]]), np.array([[1.0, 0.744, 0.006]])
+    looks = [look(0.75, 0.006)], [look(0.744, 0.006)]
 
     def doubt(u, v):
-        others = [Lamp(np.array([[1.0, start, 0.006]]), 60.0, 1.1, 300.0, 100.0) for start in (0.1, 0.4)]
+        others = [Lamp([look(start, 0.006)], 60.0, 1.1, 300.0, 100.0) for start in (0.1, 0.4)]
         lamps = [Lamp(looks[0], 94.0, 1.0, 300.0, 60.0), Lamp(looks[1], 5.0, 1.4, u, v), *others]
         return reflected(lamps, 1.0)[1]
 
@@ -162,8 +168,41 @@ def test_of_two_equal_lights_of_one_phase_neither_is_called_the_reflection():
     assert max(reflected(lamps_of((0.3, 50.0, 1.1), (0.301, 50.0, 1.1)), 1.0)) < 0.5
 
 
+def between_exposures(start, t):
+    """A look at a light of which only is known between which two exposures it begins."""
+    away = 0.0015 * np.arange(-20, 21)
+    first = start - (start % 0.0333)
+    return Look(
+        t, start + away[0], 0.0015, np.where((start + away > first) & (start + away < first + 0.023), 0.0, -50.0)
+    )
+
+
+def test_lights_that_drift_apart_are_two_labels():
+    times = np.arange(1.6, 16.0, 2.4)
+
+    def doubt(drift):
+        looks = [[between_exposures(0.306 + c * t, t) for t in times] for c in (0.0, drift)]
+        lamps = [Lamp(looks[0], 94.0, 1.0, 300.0, 60.0), Lamp(looks[1], 30.0, 1.3, 302.0, 140.0)]
+        return reflected(lamps, 1.0)[1]
+
+    assert doubt(0.0) > 0.7
+    assert doubt(-8e-4) < 0.4
+
+
+def test_a_reflection_many_rows_below_is_seen_at_another_time_by_a_rolling_shutter():
+    def doubt(delay):
+        lamps = [
+            Lamp([look(0.3, 0.002)], 94.0, 1.0, 300.0, 60.0),
+            Lamp([look(0.284, 0.002)], 30.0, 1.3, 302.0, 400.0, delay),
+        ]
+        return reflected(lamps, 1.0)[1]
+
+    assert doubt(0.016) > 0.7
+    assert doubt(0.0) < 0.2
+
+
 def test_without_a_fine_phase_nothing_is_called_a_reflection():
-    coarse = [Lamp(np.array([[1.0, 0.3, 0.03]]), peak, 1.0, 100.0, row) for peak, row in ((100.0, 50.0), (20.0, 90.0))]
+    coarse = [Lamp([look(0.3, 0.03)], peak, 1.0, 100.0, row) for peak, row in ((100.0, 50.0), (20.0, 90.0))]
     assert max(reflected(coarse, 1.0)) == 0.0
     assert len(reflected([], 1.0)) == 0
 
@@ -197,6 +236,42 @@ def test_a_shaking_camera_is_measured_and_does_not_hide_a_label():
     flashes = FlashDetector().detect(film, t)
     assert len(flashes) == 1
     assert np.hypot(flashes[0].u - 60.3 - shifts[:, 0].mean(), flashes[0].v - 70.6 - shifts[:, 1].mean()) < 0.15
+
+
+def test_lamps_that_flicker_are_measured_and_taken_off():
+    rng = np.random.default_rng(4)
+    wall = shelves(rng, (144, 192))
+    shake = Shake(3)
+    cells = np.zeros((80, 104), np.uint16)
+    first = np.rint(wall).astype(np.uint8)
+    shake.refer(first, np.zeros(2))
+    kernels.sum_cells(np.rint(1.03 * wall).astype(np.uint8), cells, 3, 5)
+    assert not shake.measure(cells).any()
+    assert shake.brightness == pytest.approx(0.03, abs=0.002)
+
+    pattern, times = PATTERNS[3], 0.004 + np.arange(90) / 30.0
+    flicker = 0.05 * np.cos(2.0 * np.pi * 10.02 * times)[None].astype(np.float32)  # 50 Hz mains, at 30 fps
+    label = 10.0 * pattern.coverage((times - 0.3) % 1.0, 0.01, 2) + 0.5 * rng.normal(size=len(times))
+    curve = (label - 150.0 * (1.0 + 0.8 * flicker)).astype(np.float32)  # a dark place in bright surroundings
+    levels = (50.0 * (1.0 + 0.8 * flicker) + 0.1 * rng.normal(size=flicker.shape)).astype(np.float32)
+    matcher, still = Matcher(pattern, 0.01, (1.0, 2.0, 5.0, 10.0)), np.zeros((len(times), 2))
+    steadied = matcher.match(times, curve, levels, still, flicker)
+    assert steadied.score[0] > 2.0 * matcher.match(times, curve, levels, still).score[0]
+    assert steadied.regular.all()
+
+
+def test_people_who_were_in_the_first_picture_are_not_taken_for_edges_for_ever():
+    rng = np.random.default_rng(5)
+    wall = shelves(rng, (144, 192))
+    crowded = wall.copy()
+    crowded[40:140, 60:100] = 30.0
+    shake, empty = Shake(3), Shake(3)
+    shake.refer(np.rint(crowded).astype(np.uint8), np.zeros(2))
+    empty.refer(np.rint(wall).astype(np.uint8), np.zeros(2))
+    assert np.any(shake.right != empty.right)
+    shake.look(np.rint(wall).astype(np.uint8))
+    assert np.array_equal(shake.right, empty.right)
+    assert np.array_equal(shake.down, empty.down)
 
 
 @pytest.mark.parametrize("place", [(2.2, 70.4), (189.3, 70.4), (90.4, 2.3), (90.4, 141.2)])

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 
 from ..bind import ranged
 from ..records import Flash
+from .flash_track import AFTER, BEFORE, Track
 from .matching import Matcher, Matches
 from .mirror import Lamp, reflected
 from .pattern import FlashPattern
-from .shake import Shake
-from .spot import Spot, fit_spot, grey_difference, light_table
+from .shake import BANDS, Shake
+from .spot import Spot, grey_difference, light_table
 
 try:
     from . import _blink as kernels
@@ -52,12 +53,15 @@ _CLEAR = 1.8  # limits from which a place is clear enough to be examined at ever
 _NO_SPOT = 12.0  # refusals that a place counts which follows the pattern but is no small light: it costs most
 _FORGET = 0.8  # of a place's refusals, from one decision to the next
 _TILE = (24, 32)  # cells over which the false alarm rate is held constant
-_BEFORE, _AFTER = 3, 5  # cells around an aperture's first one that its ring needs: 8x8 in all
 _LONGER = 2.5  # a slow camera's light curves are so much longer than `window_s`, because they have fewer frames
 _SHAKEN_PX = 1.5  # a picture that is further off is not compared
 _STALE_PX = 0.6  # a camera that stays so far off its reference gets another one
+_LOOK_S = 1.0  # after which a camera that shakes looks again at what its picture is made of
 _TESTS_APART = 4  # apertures, and starts per flash, that are about one independent test
 FLOOR_PX = 0.01  # what fits keep in bias however strong the light: sampling, texture, the camera's curve
+_STEADY = 0.002  # relative change of the light below which lamps do not flicker
+_LONELY = 1.0  # typical limits that the alternation around a light is at least
+_CENSORED = 2.5  # a light that is partly clipped may be so much less certain in place
 _SEPARATION = 3  # cells; nearer lights are one light
 
 
@@ -78,7 +82,7 @@ class FlashConfig:
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
     steady_hz: tuple[float, ...] = (1.0, 2.0, 5.0, 8.0, 10.0)
     max_candidates: int = ranged(72, minimum=1, maximum=2000, doc="apertures examined at one decision")
-    max_reflection: float = ranged(0.65, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
+    max_reflection: float = ranged(0.8, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
 
     def min_score(self, shape: tuple[int, int]) -> float:
         """Log-likelihood ratio from which a light is accepted in images of this shape (H, W)."""
@@ -87,29 +91,6 @@ class FlashConfig:
         starts = _TESTS_APART * self.pattern.period / shortest
         decisions = 3600.0 / self.window_s
         return float(np.log(max(apertures * starts * decisions / self.false_alarms_per_hour, np.e)))
-
-
-@dataclass(slots=True, eq=False)
-class Track:
-    """A light that was accepted: the aperture's first cell, its light curve's best match and its growing image."""
-
-    row: int
-    column: int
-    score: float
-    start: float  # of the best match, seconds
-    light: float  # summed linear light over the aperture when on
-    variance: float  # of the light curve about the match
-    last: float = -np.inf  # time up to which frames are in the sums
-    numerator: Floats = field(default_factory=lambda: np.zeros((8, 8)))
-    squares: Floats = field(default_factory=lambda: np.zeros((8, 8)))
-    weight: float = 0.0
-    dof: int = 0
-    clipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((8, 8), bool))
-    base: float = 0.0
-    looks: list[tuple[float, float, float]] = field(default_factory=list)  # time, start of the pattern, its sigma
-    shift: Floats = field(default_factory=lambda: np.zeros(2))  # of the picture while the light was on, weighted
-    spot: Spot | None = None
-    fitted: float = -1.0
 
 
 class FlashDetector:
@@ -132,12 +113,13 @@ class FlashDetector:
         self._ring: NDArray[np.uint16] | None = None
         self._times: deque[tuple[int, float]] = deque(maxlen=_RING)  # number of the frame, its time
         self._shifts = np.zeros((_RING, 2))
+        self._lamps = np.zeros((_RING, BANDS))  # relative change of each band's light
         self._shift_sum = np.zeros(2)  # places are given where they are in the mean picture
-        self._shake = Shake(_BEFORE)
+        self._shake = Shake(BEFORE)
         self._blocks: deque[tuple[int, NDArray[np.int16], np.int16]] = deque()  # frames, sums, lower limit
         self._count = 0
         self._block_frames = 0
-        self._due = -np.inf
+        self._due = self._looked = -np.inf
 
     def update(self, frame: NDArray[np.uint8], t: float) -> bool:
         """Take one frame.
@@ -172,7 +154,7 @@ class FlashDetector:
             return False
         self._decide(t)
         self._due = t + self.config.decision_s - 0.5 * self._pace()  # because a frame late every time adds up
-        self._keep_reference(frame)
+        self._keep_reference(frame, t)
         return True
 
     def detect(self, frames: Iterable[NDArray[np.uint8]], times: Sequence[float] | Floats) -> list[Flash]:
@@ -187,7 +169,10 @@ class FlashDetector:
         if self._block_frames >= _FEW or (self._block_frames and not self.tracks):
             self._decide(self._times[-1][1])
         seen = [(track, spot) for track in self.tracks if (spot := self.spot(track)) is not None]
-        lamps = [Lamp(np.array(track.looks), spot.peak, spot.width, spot.u, spot.v) for track, spot in seen]
+        lamps = [
+            Lamp(track.looks, spot.peak, spot.width, spot.u, spot.v, spot.v * self.config.row_time_s)
+            for track, spot in seen
+        ]
         config = self.config
         found = []
         for (track, spot), reflection in zip(seen, reflected(lamps, config.pattern.period), strict=True):
@@ -241,9 +226,18 @@ class FlashDetector:
         levels = np.empty_like(values)
         if len(rows):
             kernels.aperture_series(
-                self._ring, numbers % _RING, rows + _BEFORE, columns + _BEFORE, self._light, values, levels
+                self._ring, numbers % _RING, rows + BEFORE, columns + BEFORE, self._light, values, levels
             )
         return values, levels
+
+    def _flickers(self, numbers: Indices, rows: Indices) -> Singles | None:
+        """Relative change (N, F) of the light around places in so many rows; None where lamps are steady."""
+        bands = self._lamps[numbers % _RING]
+        bands = bands - bands.mean(axis=0)
+        if 2 * np.count_nonzero((bands**2).mean(axis=0) > _STEADY**2) < BANDS:
+            return None
+        place = np.clip((rows + 0.5) * BANDS / self._total.shape[0] - 0.5, 0.0, BANDS - 1.0)
+        return np.stack([np.interp(place, range(BANDS), band) for band in bands], axis=1).astype(np.float32)
 
     def _window_s(self) -> float:
         """Length of the light curves in seconds: what the ring holds, within limits."""
@@ -256,7 +250,7 @@ class FlashDetector:
     # ---- each frame --------------------------------------------------------------------------------------------------
 
     def _allocate(self, shape: tuple[int, int], t: float) -> None:
-        around = _BEFORE + _AFTER
+        around = BEFORE + AFTER
         self._ring = np.zeros((_RING, shape[0] + around, shape[1] + around), np.uint16)
         depth = int(np.ceil(1.7 * self._lag * _RING / self.config.window_s)) + 2
         self._differences = np.zeros((depth, *shape), np.int8)
@@ -270,10 +264,11 @@ class FlashDetector:
         assert self._ring is not None
         now = self._count % _RING
         cells = self._ring[now]
-        kernels.sum_cells(frame, cells, _BEFORE, _AFTER)
+        kernels.sum_cells(frame, cells, BEFORE, AFTER)
         if not self._count:
             self._shake.refer(frame, np.zeros(2))
         self._shifts[now] = self._shake.measure(cells)
+        self._lamps[now] = self.config.gamma * self._shake.brightness
         self._shift_sum += self._shifts[now]
         lagged = self._lagged(t)
         depth = len(self._differences)
@@ -293,7 +288,7 @@ class FlashDetector:
                 difference,
                 self._differences[lagged % depth],
                 self._total,
-                _BEFORE,
+                BEFORE,
             )
         self._times.append((self._count, t))
         self._count += 1
@@ -338,7 +333,8 @@ class FlashDetector:
             return
         numbers, times = self._recent()
         values, levels = self._curves(numbers, rows, columns)
-        matches = self._matcher.match(times, values, levels, self._shifts[numbers % _RING])
+        flicker = self._flickers(numbers, rows)
+        matches = self._matcher.match(times, values, levels, self._shifts[numbers % _RING], flicker)
         least = self.config.min_score((2 * self._total.shape[0], 2 * self._total.shape[1]))
         accepted = (
             (matches.score >= least)
@@ -356,17 +352,24 @@ class FlashDetector:
         for k in fresh:
             self._add(int(rows[k]), int(columns[k]), int(k), matches, t)
 
-    def _keep_reference(self, frame: NDArray[np.uint8]) -> None:
+    def _keep_reference(self, frame: NDArray[np.uint8], t: float) -> None:
         """Refer to the latest picture if the camera has settled away from the last reference."""
         recent = self._shifts[[number % _RING for number, _ in list(self._times)[-8:]]]
+        if not recent.any():
+            return
         middle = np.median(recent, axis=0)
-        if np.abs(middle - self._shake.offset).max() > _STALE_PX and np.ptp(recent, axis=0).max() < 0.3:
+        spread = float(np.ptp(recent, axis=0).max())
+        if np.abs(middle - self._shake.offset).max() > _STALE_PX and spread < 0.3:
             self._shake.refer(frame, self._shifts[self._times[-1][0] % _RING])
+        elif spread > 0.0 and t >= self._looked + _LOOK_S:
+            self._shake.look(frame)
+            self._looked = t
 
     def _candidates(self) -> tuple[Indices, Indices]:
         """Apertures whose alternation stands out, strongest first."""
         total, clipped = self._window.astype(np.float32), self._clipped.astype(np.float32)
-        over = np.maximum(total / self._limit(total), clipped / self._limit(clipped))
+        limit = self._limit(total)
+        over = np.maximum(total / limit, clipped / self._limit(clipped))
         over[-1] = over[:, -1] = 0.0
         for track in self.tracks:
             over[
@@ -374,10 +377,11 @@ class FlashDetector:
                 max(track.column - _SEPARATION, 0) : track.column + _SEPARATION + 1,
             ] = 0.0
         strength = np.maximum(total, clipped)
-        clear = self._peaks(
-            np.where((over > _CLEAR) & (self._refused < 0.5 * _NO_SPOT), strength, np.float32(0.0)),
-            2 * self.config.max_candidates // 3,
-        )
+        # because in a camera that shakes whole edges alternate, and far more strongly than a label, which is small
+        around = (121.0 * cv2.blur(strength, (11, 11)) - 25.0 * cv2.blur(strength, (5, 5))) / 96.0
+        lonely = strength / (np.maximum(around, 0.0) + _LONELY * float(np.median(limit)))
+        turn = lonely / (1.0 + self._refused) ** 2
+        clear = self._peaks(np.where(over > _CLEAR, turn, np.float32(0.0)), 2 * self.config.max_candidates // 3)
         # what is weaker, or found no room among the strong, has its turn before what was examined in vain
         over *= over > 1.0
         over /= 1.0 + self._refused
@@ -455,44 +459,23 @@ class FlashDetector:
             return
         values, levels = self._curves(numbers, np.array([track.row], np.intp), np.array([track.column], np.intp))
         shifts = self._shifts[numbers % _RING]
-        rest = self._matcher.cleared(times, values[0], levels[0], shifts, start, periods)
+        flicker = self._flickers(numbers, np.array([track.row], np.intp))
+        rest = self._matcher.cleared(times, values, levels, shifts, flicker, start, periods)
         if rest.weight < 2.0:
             return
-        rows = slice(track.row, track.row + _BEFORE + _AFTER)
-        columns = slice(track.column, track.column + _BEFORE + _AFTER)
-        cells = self._ring[numbers[rest.seen] % _RING, rows, columns]
-        light = self._light[cells].astype(float)
-        mean = light.mean(axis=0)
-        numerator = np.tensordot(rest.wave, light, 1)
-        explained = np.tensordot(rest.basis, light, 1)
-        track.numerator += numerator
-        track.squares += (light**2).sum(axis=0) - (explained**2).sum(axis=0) - numerator**2 / rest.weight
-        track.weight += rest.weight
-        track.dof += len(light) - 1 - len(rest.basis)
-        track.clipped |= (cells >= 985).any(axis=0)  # four pixels of which none is far from white
-        track.base = float(np.median(mean))
-        track.shift += rest.weight * rest.shift
-        track.last = t
-        if rest.sigma < 0.25 * self.config.pattern.period:
-            track.looks.append((float(times.mean()), rest.start % self.config.pattern.period, rest.sigma))
+        rows = slice(track.row, track.row + BEFORE + AFTER)
+        columns = slice(track.column, track.column + BEFORE + AFTER)
+        track.add(self._ring[numbers[rest.seen] % _RING, rows, columns], self._light, rest, t)
 
     def spot(self, track: Track) -> Spot | None:
         """Where a track's light is, in pixels; None if its image is not that of a small light, as people leave it."""
         if track.fitted != track.last:
-            variance = track.squares / max(track.dof, 1) / max(track.weight, 1e-9)
-            variance = np.maximum(variance, 0.1 * float(np.median(variance)) + 1e-9)
-            height, width = self._total.shape
-            top, left = max(0, _BEFORE - track.row), max(0, _BEFORE - track.column)
-            inside = np.s_[top : height + _BEFORE - track.row, left : width + _BEFORE - track.column]
-            image = track.numerator / max(track.weight, 1e-9)
-            middle = 2.0 * (_BEFORE - left) + 1.5, 2.0 * (_BEFORE - top) + 1.5
-            spot = fit_spot(image[inside], variance[inside], ~track.clipped[inside], pitch=2, start=middle)
+            spot = track.fit(self._total.shape)
             if spot is not None:
-                shift = track.shift / max(track.weight, 1e-9) - self._shift_sum / max(self._count, 1)
-                u = spot.u + 2.0 * (track.column - _BEFORE + left) - shift[0]
-                v = spot.v + 2.0 * (track.row - _BEFORE + top) - shift[1]
-                small = spot.sigma <= self.config.max_sigma_px and spot.width <= self.config.max_width_px
-                spot = replace(spot, u=u, v=v) if small else None
+                shift = self._shift_sum / max(self._count, 1)
+                least = self.config.max_sigma_px * (_CENSORED if track.clipped.any() else 1.0)
+                small = spot.sigma <= least and spot.width <= self.config.max_width_px
+                spot = spot.moved(shift[0], shift[1]) if small else None
             track.spot = spot
             track.fitted = track.last
         return track.spot

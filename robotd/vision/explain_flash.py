@@ -84,7 +84,9 @@ def explain_blink(detector: FlashDetector, shape: tuple[int, int]) -> FlashExpla
     if len(rows) and detector._times[-1][1] - detector._times[0][1] >= 1.4 * detector.config.pattern.period:
         numbers, times = detector._recent()
         values, levels = detector._curves(numbers, rows, columns)
-        matches = detector._matcher.match(times, values, levels, detector._shifts[numbers % blink._RING])
+        matches = detector._matcher.match(
+            times, values, levels, detector._shifts[numbers % blink._RING], detector._flickers(numbers, rows)
+        )
         for k, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
             u, v = _centre(row, column)
             why = _why_not(detector, matches, k, threshold)

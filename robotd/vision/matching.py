@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import blink_reference
-from .pattern import FlashPattern, Template
+from .pattern import FlashPattern, Look, Template
 
 try:
     from . import _blink as kernels
@@ -29,6 +29,10 @@ _HIDDEN = 0.02  # relative change of the light around a place that says somebody
 _SPREADS = 5.0  # beyond so many of its usual spreads
 _OUTLIER = 4.5  # spreads of the residual
 _ENOUGH = 0.3  # of a period's energy that must be within the window, to count by itself
+_LOOK_S, _LOOK_PITCH_S = 0.03, 0.0015  # starts so far from the best match are weighed, at this pitch
+_PROMISING = 12.0  # explained energy of a place, relative to a frame's, from which its start is refined,
+_BESIDE, _FINE_S = 0.75, 0.004  # within so many steps of the search, to so many seconds
+_CRUDE = 0.04  # of the light, that a half exposed frame is off by
 _MOST_OUTLIERS = 0.12  # of the frames that count: with more, it is not the pattern that is there
 
 
@@ -55,17 +59,18 @@ class Matches:
 class Cleared:
     """Frames that show a known light: `seen` (F,) of them, of which M are.
 
-    `wave` (M,) is the pattern less what `basis` (B, M, orthonormal) explains of it, `weight` its energy; `shift` (2,)
-    is the picture's while the light was on; `start` and `sigma` are of the pattern in seconds.
+    `wave` (M,) is the pattern less what `basis` (B, M, orthonormal) explains of it, `weight` its energy; `lamps` (M,)
+    is the light of the lamps, 1 on average; `shift` (2,) is the picture's while the light was on; `look` says when the
+    pattern may have started, None if that is unknown.
     """
 
     seen: NDArray[np.bool_]
     wave: Floats
     weight: float
     basis: Floats
+    lamps: Floats
     shift: Floats
-    start: float
-    sigma: float
+    look: Look | None
 
 
 class Matcher:
@@ -79,7 +84,9 @@ class Matcher:
         shortest = min(end - start for start, end in pattern.on)
         self._step = max(8, int(np.ceil(pattern.period / min(0.02, max(0.004, 0.3 * shortest)))))
 
-    def match(self, times: Floats, values: Singles, levels: Singles, shifts: Floats) -> Matches:
+    def match(
+        self, times: Floats, values: Singles, levels: Singles, shifts: Floats, flicker: Singles | None = None
+    ) -> Matches:
         """Match N light curves.
 
         Parameters
@@ -89,7 +96,10 @@ class Matcher:
             Light of each place, and of what is around it.
         shifts : (F, 2) array
             Shift of the picture in px.
+        flicker : (N, F) array, optional
+            Relative change of the lamps' light near each place.
         """
+        values, levels, _ = _steadied(values, levels, flicker)
         seen = self._seen(levels)
         starts, single = self._starts(times)
         basis = _moved(shifts)
@@ -112,19 +122,22 @@ class Matcher:
         values: Singles,
         levels: Singles,
         shifts: Floats,
+        flicker: Singles | None,
         start: float,
         periods: int,
     ) -> Cleared:
-        """Choose the frames (F,) of a known light that show it, and what its image is regressed on.
+        """Choose the frames of a known light that show it, and what its image is regressed on.
 
         Parameters
         ----------
-        times, values, levels, shifts
-            As of `match`, of one place.
+        times, values, levels, shifts, flicker
+            As of `match`, of one place (N = 1).
         start, periods
             Its best match.
         """
-        seen = self._seen(levels[None])[0]
+        steady, levels, lamps = _steadied(values, levels, flicker)
+        values = steady[0]
+        seen = self._seen(levels)[0]
         wave = self._pattern.coverage(times - start, self._exposure, periods)
         dark = float(np.median(values[seen & (wave < 0.01)])) if np.any(seen & (wave < 0.01)) else 0.0
         lit = values[seen & (wave > 0.9)] if np.any(seen & (wave > 0.9)) else values[seen & (wave > 0.4)]
@@ -137,26 +150,29 @@ class Matcher:
         on = wave.sum()
         shift = wave @ shifts[seen] / on if on > 0.0 else np.zeros(2)
         wave = wave - (basis @ wave) @ basis
-        found, sigma = self._refined(times[seen], values[seen].astype(float), start, periods, basis)
-        return Cleared(seen, wave, float(wave @ wave), basis, shift, found, sigma)
+        look = self._look(times[seen], values[seen].astype(float), start, periods, basis, abs(light))
+        return Cleared(seen, wave, float(wave @ wave), basis, lamps[0, seen].astype(float), shift, look)
 
-    def _refined(self, times: Floats, values: Floats, start: float, periods: int, basis: Floats) -> tuple[float, float]:
-        """Start of one run to a few milliseconds, and its standard deviation."""
+    def _look(
+        self, times: Floats, values: Floats, start: float, periods: int, basis: Floats, light: float
+    ) -> Look | None:
+        """When one run of the pattern may have started, near its best match."""
         if len(times) < 8:
-            return start, np.inf
-        reach = self._pattern.period / self._step
-        offsets = np.linspace(-1.5 * reach, 1.5 * reach, 31)
-        waves = np.stack([self._pattern.coverage(times - start - o, self._exposure, periods) for o in offsets])
-        waves -= (waves @ basis.T) @ basis
+            return None
+        pace = (times[-1] - times[0]) / (len(times) - 1)
+        # because all starts between two frames' exposures look the same
+        reach = max(1.5 * self._pattern.period / self._step, _LOOK_S, 0.6 * pace)
+        offsets = np.arange(-int(reach / _LOOK_PITCH_S), int(reach / _LOOK_PITCH_S) + 1) * _LOOK_PITCH_S
+        waves = self._template.run(times - start - offsets[:, None], periods).astype(float)
+        waves -= np.einsum("ob,bf->of", np.einsum("of,bf->ob", waves, basis), basis)
         y = values - (basis @ values) @ basis
         energy = np.maximum(np.einsum("of,of->o", waves, waves), 1e-6)
-        product = waves @ y
+        product = np.einsum("of,f->o", waves, y)
         gain = np.where(product > 0.0, product**2 / energy, 0.0)
         variance = max(float(y @ y - gain.max()), 1e-6) / max(len(times) - 2 - len(basis), 1)
-        weight = np.exp(np.maximum((gain - gain.max()) / (2.0 * variance), -60.0))
-        mean = float(weight @ offsets / weight.sum())
-        sigma = float(np.sqrt(weight @ (offsets - mean) ** 2 / weight.sum() + (offsets[1] - offsets[0]) ** 2 / 12.0))
-        return start + mean, sigma
+        likelihood = (gain - gain.max()) / (2.0 * (variance + (_CRUDE * light) ** 2))
+        look = Look(float(times.mean()), start + float(offsets[0]), _LOOK_PITCH_S, likelihood)
+        return look if look.sigma < 0.25 * self._pattern.period else None
 
     def _starts(self, times: Floats) -> tuple[Floats, Singles]:
         period = self._pattern.period
@@ -195,26 +211,55 @@ class Matcher:
         gain, light = np.empty(places, np.float32), np.empty(places, np.float32)
         start, periods = np.empty(places, np.intp), np.empty(places, np.intp)
         kernels.best_runs(projection, sums, squares, self._step, frames, _LEAST, gain, start, periods, light)
+        count: Floats = periods.astype(float)
+        begin: Floats = starts[start]
+        promising = np.flatnonzero(frames * gain > _PROMISING * energy)
+        if len(promising):
+            self._refine(times, y, weights, frames, begin, count, promising)
+        parts = [
+            self._template(times - (begin + k * self._pattern.period)[:, None]) * (k < periods)[:, None]
+            for k in range(int(periods.max(initial=0.0)))
+        ]
+        wave = np.sum(parts, axis=0) if parts else np.zeros_like(y)
+        wave, gain, light = _regressed(y, weights, frames, wave)
         left = np.maximum(energy - gain, 1e-6)
-        wave = np.zeros_like(y)
-        for k in range(int(periods.max(initial=0))):
-            index = np.minimum(start + k * self._step, len(starts) - 1)
-            wave += np.where((k < periods)[:, None], single[index], np.float32(0.0))
-        wave -= (np.einsum("nf,nf->n", wave, weights) / frames)[:, None]
         residual = (y - light[:, None] * wave) * weights
         half = 0.5 * (frames.astype(float) - basis.shape[1])
         matches = Matches(
             score=half * np.log(energy / left),
             margin=half * np.log(self._steady_residual(times, y, weights, energy) / left),
-            start=starts[start],
-            periods=periods,
+            start=begin,
+            periods=periods.astype(np.intp),
             light=light.astype(float),
             variance=left / np.maximum(frames - 2.0, 1.0),
-            regular=self._is_regular(projection, squares, start, periods, light),
+            regular=_is_regular(y, weights, parts, light) & (frames >= 0.4 * len(times)),
             frames=frames.astype(float),
         )
-        matches.regular &= frames >= 0.4 * len(times)
         return matches, residual
+
+    def _refine(
+        self,
+        times: Floats,
+        y: Singles,
+        weights: Singles,
+        frames: Singles,
+        begin: Floats,
+        periods: Floats,
+        chosen: Indices,
+    ) -> None:
+        """Move the starts `begin` of the chosen places between the steps of the search, in place.
+
+        Short flashes need it: within one step they may fall from one exposure into the gap before the next.
+        """
+        y, weights, frames = y[chosen], weights[chosen], frames[chosen]
+        middle, best = begin[chosen], np.full(len(chosen), -1.0)
+        pitch = self._pattern.period / self._step
+        for offset in pitch * np.linspace(-_BESIDE, _BESIDE, 2 * int(np.ceil(_BESIDE * pitch / _FINE_S)) + 1):
+            wave = self._template.run(times - (middle + offset)[:, None], periods[chosen, None])
+            _, gain, light = _regressed(y, weights, frames, wave)
+            better = (gain > best) & (light > 0.0)
+            best[better] = gain[better]
+            begin[chosen[better]] = middle[better] + offset
 
     def _steady_residual(self, times: Floats, y: Singles, weights: Singles, energy: Floats) -> Floats:
         """What the best steady blinking (a sine with its third harmonic) leaves of each light curve's energy."""
@@ -225,28 +270,48 @@ class Matcher:
             least = np.minimum(least, energy - _explained(y, weights, waves.astype(np.float32)))
         return np.maximum(least, 1e-6)
 
-    def _is_regular(
-        self, projection: Singles, squares: Singles, start: Indices, periods: Indices, light: Singles
-    ) -> NDArray[np.bool_]:
-        """Two periods or more must each carry their share: one burst of clutter is no pattern.
 
-        Periods that the window cuts short count together, because two seconds may hold no two whole ones.
-        """
-        rows = np.arange(len(start))
-        enough = _ENOUGH * squares.max(axis=1)
-        carrying, missing = np.zeros(len(start), int), np.zeros(len(start), int)
-        product, energy = np.zeros(len(start)), np.zeros(len(start))  # of all that are too short to count alone
-        for k in range(int(periods.max(initial=0))):
-            index = np.minimum(start + k * self._step, squares.shape[1] - 1)
-            counted = (k < periods) & (squares[rows, index] >= enough)
-            share = projection[rows, index] / np.maximum(squares[rows, index], 1e-6)
-            carrying += counted & (share >= 0.4 * light)
-            missing += counted & (share < 0.2 * light)
-            short = (k < periods) & ~counted
-            product += np.where(short, projection[rows, index], 0.0)
-            energy += np.where(short, squares[rows, index], 0.0)
-        carrying += (energy >= enough) & (product >= 0.4 * light * energy)
-        return np.asarray((carrying >= 2) & (missing == 0))
+def _regressed(y: Singles, weights: Singles, frames: Singles, wave: Singles) -> tuple[Singles, Singles, Singles]:
+    """The wave (N, F) centred over the frames that count, the energy it explains of each y, and its factor."""
+    wave = wave - (np.einsum("nf,nf->n", wave, weights) / frames)[:, None]
+    product = np.einsum("nf,nf->n", y, wave)
+    norm = np.maximum(np.einsum("nf,nf,nf->n", wave, wave, weights), _LEAST * frames)
+    return wave, product * product / norm, product / norm
+
+
+def _is_regular(y: Singles, weights: Singles, parts: list[Singles], light: Singles) -> NDArray[np.bool_]:
+    """Two periods or more must each carry their share: one burst of clutter is no pattern.
+
+    Periods that the window cuts short count together, because two seconds may hold no two whole ones.
+    """
+    if not parts:
+        return np.zeros(len(y), bool)
+    products = np.stack([np.einsum("nf,nf->n", y, part) for part in parts], axis=1)
+    energies = np.stack([np.einsum("nf,nf,nf->n", weights, part, part) for part in parts], axis=1)
+    enough = np.maximum(_ENOUGH * energies.max(axis=1, keepdims=True), 1e-6)
+    counted = energies >= enough
+    share = products / np.maximum(energies, 1e-6)
+    carrying = np.count_nonzero(counted & (share >= 0.4 * light[:, None]), axis=1)
+    missing = np.any(counted & (share < 0.2 * light[:, None]), axis=1)
+    product, energy = np.where(counted, 0.0, products).sum(axis=1), np.where(counted, 0.0, energies).sum(axis=1)
+    carrying += (energy >= enough[:, 0]) & (product >= 0.4 * light * energy)
+    return np.asarray((carrying >= 2) & ~missing)
+
+
+def _steadied(values: Singles, levels: Singles, flicker: Singles | None) -> tuple[Singles, Singles, Singles]:
+    """Light curves and levels as under lamps that do not flicker, and what the lamps did (N, F), 1 on average.
+
+    Lamps are not the same everywhere: how much of the flicker a place has is taken from what is around it.
+    """
+    if flicker is None:
+        return values, levels, np.ones_like(values)
+    usual = np.maximum(np.median(levels, axis=1, keepdims=True), 1e-3)
+    most = 3.0 * np.abs(flicker).max(axis=1, keepdims=True)
+    away = np.clip(levels / usual - 1.0, -most, most)
+    energy = np.maximum(np.einsum("nf,nf->n", flicker, flicker), 1e-9)
+    share = np.clip(np.einsum("nf,nf->n", flicker, away) / energy, 0.0, 2.0)[:, None]
+    lamps = np.maximum(1.0 + share * flicker, 0.5).astype(np.float32)
+    return values - np.median(values, axis=1, keepdims=True) * (lamps - 1.0), levels / lamps, lamps
 
 
 def _moved(shifts: Floats) -> Singles:

@@ -12,8 +12,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from .pattern import Look
 
 Floats = NDArray[np.float64]
 
@@ -22,9 +25,13 @@ _WEIGHT = 8.0  # lights that the first guess of that fraction counts for
 _ROUNDS = 4
 _CROWDED = 1.6  # log-odds against a lamp's further reflection, for each that it has
 _STAMPS_S = 0.0015  # what time stamps and rows leave uncertain between two places of a picture
-_LOOK_S = 0.0005  # no look is surer
-_DISPROOF = 6.0  # squared spreads beyond which a difference speaks against one lamp by itself
+_WRONG = 12.0  # no look speaks more than e^12 against a start: somebody may have walked by
 _COARSE_S = 0.015  # starts known no better than so tell nothing: at 10 frames a second every tenth pair would agree
+_GRID_S, _REACH = 0.001, 60  # starts that are weighed: so many steps to both sides
+_CLOCKS = 1e-4 * np.array([-24, -16, -11, -7.5, -5, -3.5, -2, -1, 0, 1, 2, 3.5, 5, 7.5, 11, 16, 24])
+_CLOCK = 3e-4  # by which the period of a label may be off, typically
+_CLOCK_SHARES = np.gradient(_CLOCKS) / (1.0 + (_CLOCKS / _CLOCK) ** 2)
+_CLOCK_SHARES /= _CLOCK_SHARES.sum()
 _LOSS = (-1.0, 0.6)  # mean and standard deviation of log(reflected peak / direct peak)
 _LABELS = 1.3  # standard deviation of log(peak) between labels, times the square root of 2
 _BLUR = (0.2, 0.2)  # the same of log(width)
@@ -38,15 +45,16 @@ _ASIDE = (4.0, 0.05)  # px, and of the distance: uneven floors, and cameras that
 class Lamp:
     """A light as the fingerprint sees it.
 
-    `starts` is (K, 3): time of a look, start of the pattern in seconds, and its standard deviation; `peak` is the
-    brightest pixel's in any unit, `width`, `u` and `v` in px.
+    `looks` say when its pattern started, seen `delay` seconds after the frame's time stamp; `peak` is the brightest
+    pixel's in any unit, `width`, `u` and `v` in px.
     """
 
-    starts: Floats
+    looks: Sequence[Look]
     peak: float
     width: float
     u: float
     v: float
+    delay: float = 0.0
 
 
 def reflected(lamps: Sequence[Lamp], period: float) -> Floats:
@@ -59,10 +67,10 @@ def reflected(lamps: Sequence[Lamp], period: float) -> Floats:
     """
     count = len(lamps)
     odds = np.zeros((count, count))  # [i, j]: that i reflects j, against two labels by themselves
-    for i in range(count):
-        for j in range(count):
-            if i != j:
-                odds[i, j] = np.exp(min(_odds(lamps[i], lamps[j], period), 50.0))
+    together = _together(lamps, period)
+    for i, j in np.argwhere(together > -np.inf):
+        known = together[i, j] + _dimmed(lamps[i], lamps[j]) + _placed(lamps[i], lamps[j])
+        odds[i, j] = np.exp(min(known, 50.0))
     prior = _PRIOR
     probability = np.zeros(count)
     for _ in range(_ROUNDS):
@@ -87,33 +95,62 @@ def _directness(lamp: Lamp) -> float:
     return float(loss - np.log(max(lamp.width, 1e-3)) * _BLUR[0] / _BLUR[1] ** 2)
 
 
-def _odds(a: Lamp, b: Lamp, period: float) -> float:
-    """Log-likelihood ratio of all that is known: a reflects b, against two labels."""
-    return _together(a, b, period) + _dimmed(a, b) + _placed(a, b)
+def _together(lamps: Sequence[Lamp], period: float) -> Floats:
+    """Log-likelihood ratio (N, N) of the starts: one label's, against two labels'; -inf where they tell nothing.
 
-
-def _together(a: Lamp, b: Lamp, period: float) -> float:
-    """Log-likelihood ratio of the starts: the same at every time, against any.
-
-    The differences at all times at which both were looked at are averaged, but their uncertainty does not shrink by
-    it, because starts that fall between the same two exposures look the same every time.
+    One label has one start and one clock, which is a little fast or slow. Two labels that start together, between the
+    same two exposures, drift apart, unless their clocks happen to agree too.
     """
-    weight, mean, least = 0.0, 0.0, np.inf
-    apart = []
-    for t, start, sigma in a.starts:
-        near = b.starts[np.argmin(np.abs(b.starts[:, 0] - t))]
-        variance = float(sigma**2 + near[2] ** 2) + _LOOK_S**2
-        if abs(near[0] - t) <= 1.5 * period and variance <= _COARSE_S**2:
-            difference = float((start - near[1] + 0.5 * period) % period - 0.5 * period)
-            apart.append(difference**2 / (variance + _STAMPS_S**2))
-            least = min(least, variance)
-            weight += 1.0 / variance
-            mean += difference / variance
-    if not apart:
-        return -np.inf
-    variance = least + _STAMPS_S**2
-    spread = max(0.0, max(apart) - _DISPROOF)  # because one time far apart disproves it
-    return float(-0.5 * (mean / weight) ** 2 / variance + np.log(period / np.sqrt(2.0 * np.pi * variance)) - spread)
+    count = len(lamps)
+    ratio = np.full((count, count), -np.inf)
+    stamps = [look.t for lamp in lamps for look in lamp.looks]
+    middle = 0.5 * (min(stamps) + max(stamps)) if stamps else 0.0
+    starts = [_start(lamp, middle, period) for lamp in lamps]
+    for i, a in enumerate(starts):
+        for j, b in enumerate(starts[:i]):
+            if a is None or b is None:
+                continue
+            apart = round(((a.start - b.start + 0.5 * period) % period - 0.5 * period) / _GRID_S)
+            if abs(apart) <= _REACH:
+                size = 2 * _REACH + 1
+                ours = a.likelihood[max(-apart, 0) : size - max(apart, 0)]
+                theirs = b.likelihood[max(apart, 0) : size - max(-apart, 0)]
+                same = float(np.einsum("sc,sc,c->", ours, theirs, _CLOCK_SHARES))
+                ratio[i, j] = ratio[j, i] = np.log(max(same, 1e-30) / (a.total * b.total) * period / _GRID_S)
+    return ratio
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """Likelihood (starts, clocks) of a lamp, on a grid with `start` in its middle; `total` is its weighted sum."""
+
+    start: float
+    likelihood: Floats
+    total: float
+
+
+def _start(lamp: Lamp, middle: float, period: float) -> _Start | None:
+    """What a lamp's looks say together; the starts are those at the time `middle`."""
+    if not lamp.looks:
+        return None
+    surest = min(lamp.looks, key=lambda look: look.sigma)
+    if surest.sigma > _COARSE_S:
+        return None
+    since = surest.start + lamp.delay
+    grid = since + _GRID_S * np.arange(-_REACH, _REACH + 1)
+    total = np.zeros((len(grid), len(_CLOCKS)))
+    for look in lamp.looks:
+        centre = look.first + 0.5 * look.pitch * (len(look.log_likelihood) - 1)
+        then = grid[:, None] - lamp.delay + _CLOCKS * (look.t - middle)
+        off = (then - centre + 0.5 * period) % period - 0.5 * period
+        index = (off + centre - look.first) / look.pitch
+        known = np.maximum(look.log_likelihood, -_WRONG)
+        total += np.interp(index, np.arange(len(known)), known, -_WRONG, -_WRONG)
+    likelihood = np.exp(total - total.max())
+    away = _GRID_S * np.arange(-4, 5)
+    blur = np.exp(-((away / _STAMPS_S) ** 2))  # half the variance, because both have it
+    likelihood = cv2.filter2D(likelihood, -1, (blur / blur.sum())[:, None], borderType=cv2.BORDER_REPLICATE)
+    return _Start(since, likelihood, float(np.einsum("sc,c->", likelihood, _CLOCK_SHARES)))
 
 
 def _dimmed(a: Lamp, b: Lamp) -> float:

@@ -62,10 +62,41 @@ class FlashPattern:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """When a light's pattern may have started, as one stretch of frames around the time `t` says.
+
+    `log_likelihood` (K,) is that of the starts `first`, `first + pitch` and so on (s); its largest is 0.
+    """
+
+    t: float
+    first: float
+    pitch: float
+    log_likelihood: Floats
+
+    @property
+    def start(self) -> float:
+        """Mean of the starts, s."""
+        return self._mean_and_sigma()[0]
+
+    @property
+    def sigma(self) -> float:
+        """Their standard deviation, s."""
+        return self._mean_and_sigma()[1]
+
+    def _mean_and_sigma(self) -> tuple[float, float]:
+        weights = np.exp(self.log_likelihood)
+        weights /= weights.sum()
+        starts = self.first + self.pitch * np.arange(len(weights))
+        mean = float(weights @ starts)
+        return mean, float(np.sqrt(weights @ (starts - mean) ** 2 + self.pitch**2 / 12.0))
+
+
 class Template:
     """`FlashPattern.coverage` of one period, tabulated because it is looked up for every start and frame."""
 
     def __init__(self, pattern: FlashPattern, exposure: float) -> None:
+        self._period = pattern.period
         self._first = -exposure - _TABLE_S
         self._table = pattern.coverage(
             np.arange(self._first, pattern.period + 2.0 * _TABLE_S, _TABLE_S), exposure
@@ -75,3 +106,11 @@ class Template:
         """Fraction of light in exposures that begin so many seconds after the start of a period."""
         index = ((since_start - self._first) * (1.0 / _TABLE_S) + 0.5).astype(np.int32)
         return self._table.take(index, mode="clip")
+
+    def run(self, since_start: Floats, periods: Floats | float) -> Singles:
+        """The same, for a pattern that is repeated so many times (broadcast)."""
+        number = np.floor(since_start / self._period)
+        within = since_start - number * self._period
+        begun = (number >= 0.0) & (number < periods)
+        next_one = (number >= -1.0) & (number < periods - 1.0)  # an exposure may see the end of one and the next one
+        return self(within) * begun + self(within - self._period) * next_one

@@ -14,7 +14,8 @@ except ImportError:  # built with ROBOTD_NO_EXTENSIONS=1
 
 Floats = NDArray[np.float64]
 
-_TILES = (6, 8)
+BANDS = 6  # of rows, because a rolling shutter sees lamps flicker in waves
+_TILES = (BANDS, 8)
 _ROW_STEP = 4  # every fourth row of apertures is looked at
 _ROUNDS = 5
 _AGREE_PX = 0.1  # a tile that is further off has somebody in it
@@ -33,25 +34,35 @@ class Shake:
     def __init__(self, before: int) -> None:
         self._before = before
         self.offset = np.zeros(2)  # of the reference against the first picture
+        self.brightness = np.zeros(BANDS)  # relative change of the last picture's grey levels against the first one
+        self._brightness = np.zeros(BANDS)  # of the reference
         self._moments = np.zeros((*_TILES, 3), np.float32)
         self._reference = np.zeros((0, 0), np.int16)
-        self.down = np.zeros((0, 0), np.int16)  # change of each aperture per px that the picture moves up
-        self.right = np.zeros((0, 0), np.int16)
+        self._down = np.zeros((0, 0), np.int16)
+        self._right = np.zeros((0, 0), np.int16)
+        self.down = self._down  # change of each aperture per px that the picture moves up
+        self.right = self._right
 
     def refer(self, image: NDArray[np.uint8], offset: Floats) -> None:
         """Take a picture (H, W) as the reference; it is shifted by `offset` (u, v) against the first one."""
         self.offset = np.asarray(offset, float).copy()
+        pixels = _padded(image)
         height, width = image.shape[0] // 2, image.shape[1] // 2
-        pixels = np.pad(image[: 2 * height, : 2 * width], ((1, 4), (1, 4)), "edge").astype(np.int32)
         self._reference = np.ascontiguousarray(_fours(_fours(pixels[1:, 1:]).T).T[:height, :width], np.int16)
-        self.down = np.ascontiguousarray(_fours(_edges(pixels)[:, 1:].T).T[:height, :width], np.int16)
-        self.right = np.ascontiguousarray(_fours(_edges(pixels.T)[:, 1:].T)[:height, :width], np.int16)
-        tiles_down, tiles_right = self._tiled(self.down), self._tiled(self.right)
+        self._down, self._right = self.down, self.right = _gradients(pixels)
+        tiles_down, tiles_right = self._tiled(self._down), self._tiled(self._right)
         self._mean = np.stack([tiles_right.mean(axis=1), tiles_down.mean(axis=1)])
         tiles_right, tiles_down = tiles_right - self._mean[0][:, None], tiles_down - self._mean[1][:, None]
         self._xx = (tiles_right**2).sum(axis=1)
         self._xy = (tiles_right * tiles_down).sum(axis=1)
         self._yy = (tiles_down**2).sum(axis=1)
+        self._sums = np.maximum(self._tiled(self._reference).sum(axis=1), 1.0)
+        self._counted = tiles_right.shape[1]
+        self._brightness = self.brightness
+
+    def look(self, image: NDArray[np.uint8]) -> None:
+        """Take `down` and `right` from a picture: people stand elsewhere than in the reference by now."""
+        self.down, self.right = _gradients(_padded(image))
 
     def _tiled(self, picture: NDArray[np.int16]) -> Floats:
         high, wide = picture.shape[0] // _TILES[0], picture.shape[1] // _TILES[1]
@@ -59,9 +70,20 @@ class Shake:
         return tiles[:, ::_ROW_STEP].transpose(0, 2, 1, 3).reshape(_TILES[0] * _TILES[1], -1).astype(float)
 
     def measure(self, cells: NDArray[np.uint16]) -> Floats:
-        """Shift (u, v) in px of a picture against the first one; the reference's while noise could be the cause."""
-        kernels.shift_moments(cells, self._reference, self.down, self.right, self._before, _ROW_STEP, self._moments)
+        """Shift (u, v) in px of a picture against the first one; the reference's while noise could be the cause.
+
+        Its change of `brightness` is measured as well, by the tiles' median, because people cover some.
+        """
+        kernels.shift_moments(cells, self._reference, self._down, self._right, self._before, _ROW_STEP, self._moments)
         moments = self._moments.reshape(-1, 3).T.astype(float)
+        shift = self._shift(moments)
+        change = (moments[2] - self._counted * (shift @ self._mean)) / self._sums
+        middle = np.sort(change.reshape(_TILES), axis=1)[:, _TILES[1] // 2 - 1 : _TILES[1] // 2 + 1]
+        self.brightness = self._brightness + 0.5 * (middle[:, 0] + middle[:, 1])
+        return np.asarray(self.offset - shift)
+
+    def _shift(self, moments: Floats) -> Floats:
+        """By how much the reference has moved from a picture; zero while noise could be the cause."""
         xd, yd = moments[0] - self._mean[0] * moments[2], moments[1] - self._mean[1] * moments[2]
         weights = np.ones(len(xd))
         shift = np.zeros(2)
@@ -72,18 +94,30 @@ class Shake:
             p, q = float(weights @ xd), float(weights @ yd)
             determinant = a * c - b * b
             if determinant <= 1e-3 * a * c or a * c <= 0.0:
-                return self.offset.copy()
+                return np.zeros(2)
             shift = np.array([(c * p - b * q) / determinant, (a * q - b * p) / determinant])
             if np.abs(shift).max() < _QUIET_PX:
-                return self.offset.copy()
+                return np.zeros(2)
             miss_x = xd - self._xx * shift[0] - self._xy * shift[1]
             miss_y = yd - self._xy * shift[0] - self._yy * shift[1]
             miss = np.hypot(miss_x, miss_y) / scale
             weights = 1.0 / (1.0 + miss**2)
         still = np.hypot(xd, yd) / scale
         if np.minimum(miss, 1.0).sum() > _BETTER * np.minimum(still, 1.0).sum():
-            return self.offset.copy()
-        return np.asarray(self.offset - shift)
+            return np.zeros(2)
+        return shift
+
+
+def _padded(image: NDArray[np.uint8]) -> NDArray[np.int32]:
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    return np.pad(image[: 2 * height, : 2 * width], ((1, 4), (1, 4)), "edge").astype(np.int32)
+
+
+def _gradients(pixels: NDArray[np.int32]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Change of each aperture per px that a picture moves up, and left."""
+    height, width = (pixels.shape[0] - 5) // 2, (pixels.shape[1] - 5) // 2
+    down = np.ascontiguousarray(_fours(_edges(pixels)[:, 1:].T).T[:height, :width], np.int16)
+    return down, np.ascontiguousarray(_fours(_edges(pixels.T)[:, 1:].T)[:height, :width], np.int16)
 
 
 def _fours(pixels: NDArray[Any]) -> NDArray[Any]:

@@ -6,7 +6,7 @@ raw grey levels the position keeps a bias of 0.03 to 0.06 px, however long one l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 _ITERATIONS = 15
+_WIDTH = np.log(1.1), 0.35  # mean and spread of log(px): without it a spot within 2x2 cells could be anywhere in them
 _WIDTH_LIMITS = (0.45, 4.0)  # px: narrower than a pixel's own response is a hot pixel, wider is no label
 
 
@@ -31,6 +32,10 @@ class Spot:
     def sigma(self) -> float:
         """Standard deviation per axis in pixels."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
+
+    def moved(self, right: float, down: float) -> Spot:
+        """The same, so many pixels further right and down."""
+        return replace(self, u=self.u + right, v=self.v + down)
 
 
 def light_table(gamma: float, steps: int) -> NDArray[np.float32]:
@@ -70,7 +75,8 @@ def fit_spot(
     Notes
     -----
     Levenberg-Marquardt on peak, u, v, log width and constant. The Gaussian is evaluated at pixel centres and averaged
-    over the cell. Clipped cells are censored observations: they count where the model falls below them.
+    over the cell. Clipped cells are censored observations: they count where the model falls below them. The width is
+    drawn to what lenses do, weakly: it matters where cells tell nothing of it, and would leave the place open too.
     """
     if np.count_nonzero(valid) < 12:
         return None
@@ -98,22 +104,26 @@ def _descend(
     counted, cost = weights, np.inf
     residuals, jacobian = _model(parameters, image, pixels, pitch)
 
-    def weigh(residuals: Floats) -> tuple[Floats, float]:
+    def weigh(residuals: Floats, log_width: float) -> tuple[Floats, float]:
         counted = np.where(valid | (residuals > 0.0), weights, 0.0)
-        return counted, float(np.sum(counted * residuals**2))
+        return counted, float(np.sum(counted * residuals**2) + ((log_width - _WIDTH[0]) / _WIDTH[1]) ** 2)
 
-    counted, cost = weigh(residuals)
+    usual = np.zeros((5, 5))
+    usual[3, 3] = 1.0 / _WIDTH[1] ** 2
+    counted, cost = weigh(residuals, parameters[3])
     damping = 1e-3
     for _ in range(_ITERATIONS):
         weighted = jacobian * counted.ravel()
-        normal = weighted @ jacobian.T
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), weighted @ residuals.ravel())
+        normal = weighted @ jacobian.T + usual
+        downhill = weighted @ residuals.ravel()
+        downhill[3] -= (parameters[3] - _WIDTH[0]) * usual[3, 3]
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), downhill)
         step[1:3] = np.clip(step[1:3], -1.0, 1.0)
         step[3] = np.clip(step[3], -0.5, 0.5)
         trial = parameters + step
         trial[3] = np.clip(trial[3], *np.log(_WIDTH_LIMITS))
         new_residuals, new_jacobian = _model(trial, image, pixels, pitch)
-        new_counted, new_cost = weigh(new_residuals)
+        new_counted, new_cost = weigh(new_residuals, trial[3])
         if new_cost <= cost:
             settled = cost - new_cost < 1e-6 * cost + 1e-9
             parameters, residuals, jacobian, counted, cost = trial, new_residuals, new_jacobian, new_counted, new_cost
@@ -122,7 +132,7 @@ def _descend(
                 break
         else:
             damping *= 8.0
-    return cost, parameters, (jacobian * counted.ravel()) @ jacobian.T
+    return cost, parameters, (jacobian * counted.ravel()) @ jacobian.T + usual
 
 
 def _starts(image: Floats, valid: NDArray[np.bool_], pitch: int, start: tuple[float, float] | None) -> list[Floats]:
