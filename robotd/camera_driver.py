@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Coroutine
+from dataclasses import replace
 from typing import Any
 
 from .camera_feed import CameraCounters, CameraMeter
@@ -35,6 +36,7 @@ class CameraDriver(Driver):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._mode: CameraMode | None = None  # what is wanted; None: nothing
+        self._late = self.calibration.stamp_offsets.get(self.name, 0.0)
         self.given: CameraMode | None = None
         self.remarks: tuple[str, ...] = ()
         self._changed = asyncio.Event()
@@ -89,9 +91,14 @@ class CameraDriver(Driver):
         self._check_at = now() + CHECK_S
 
     def _publish(self, frame: Frame, mode: CameraMode) -> None:
-        """Show a frame of this mode to whoever listens; nothing of an old mode is seen once another one is wanted."""
+        """Show a frame of this mode to whoever listens, with its stamp put right by the calibration.
+
+        Nothing of an old mode is seen once another one is wanted.
+        """
         if self._mode != mode:
             return
+        if self._late:
+            frame = replace(frame, t=frame.t - self._late)
         self.bus.frames(self.name).publish(frame)
         self._meter.add(frame, now())
         if now() >= self._check_at:

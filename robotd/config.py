@@ -170,7 +170,10 @@ class Config:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """The whole of calibration.toml: what calibrations found, and how sure they were (`priors`)."""
+    """The whole of calibration.toml: what calibrations found, and how sure they were (`priors`).
+
+    `stamp_offsets` is by how many seconds each camera's stamps are late.
+    """
 
     wheels: Wheels = field(default_factory=Wheels)
     cameras: tuple[CameraModel, ...] = ()
@@ -178,6 +181,7 @@ class Calibration:
     beacons: dict[str, Vector3] = field(default_factory=dict)
     gamma: float = ranged(2.2, minimum=0.5, maximum=4.0)
     row_time_s: float = ranged(0.0, minimum=0.0, maximum=0.001)
+    stamp_offsets: dict[str, float] = field(default_factory=dict)
     priors: Priors = field(default_factory=Priors)
     sigmas: Sigmas = field(default_factory=lambda: Sigmas(pixel_px=0.2))
 
@@ -250,6 +254,7 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     for section in ("wheels", "priors", "sigmas"):
         lines += ["", f"[{section}]", *_lines(getattr(calibration, section))]
     lines += ["", "[beacons]", *(f"{toml(name)} = {toml(at)}" for name, at in calibration.beacons.items())]
+    lines += ["", "[stamp_offsets]", *(f"{toml(name)} = {late!r}" for name, late in calibration.stamp_offsets.items())]
     for camera in calibration.cameras:
         lines += ["", "[[cameras]]", *_lines(camera)]
     if calibration.floor_camera is not None:
@@ -374,6 +379,22 @@ def save_rig(cameras: Sequence[CameraModel], beacons: Mapping[str, Vector3], pat
     text = replace_table(text, "priors", {name: repr(getattr(priors, name)) for name in names}, str(path))
     if beacons:
         text = replace_table(text, "beacons", {name: toml(place) for name, place in beacons.items()}, str(path))
+    bind(Calibration, tomllib.loads(text), str(path))
+    _replace(path, text)
+
+
+def save_stamp_offsets(offsets: Mapping[str, float], path: Path) -> None:
+    """Write [stamp_offsets] into calibration.toml, which need not exist; all else in the file stays as it was.
+
+    Replaces the file atomically. Raises ConfigError if the file cannot be read or edited.
+    """
+    text = ""
+    if path.exists():
+        read_toml(path)
+        text = path.read_text(encoding="utf-8")
+    text = replace_table(
+        text, "stamp_offsets", {name: repr(round(late, 5)) for name, late in offsets.items()}, str(path)
+    )
     bind(Calibration, tomllib.loads(text), str(path))
     _replace(path, text)
 

@@ -1,6 +1,6 @@
-"""The arguments of `robotd-solver calibrate rig` and `calibrate odometry`; what they run is in rig_tool.
+"""The arguments of `robotd-solver calibrate rig`, `odometry` and `time`; what they run is in rig_tool and time_tool.
 
-Apart from it, because a command line that only prints its help should not load scipy.
+Apart from these, because a command line that only prints its help should not load scipy.
 """
 
 from __future__ import annotations
@@ -53,6 +53,22 @@ def add_calibrate_rig(kinds: argparse._SubParsersAction[argparse.ArgumentParser]
     odometry.set_defaults(run=_run_odometry)
 
 
+def add_calibrate_time(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The arguments of `robotd-solver calibrate time`."""
+    parser = kinds.add_parser(
+        "time",
+        help="by how much cameras' stamps are late, from a robot that turned to and fro",
+        description="FOLDER is what `robotctl calibrate time` made: its data.json names the recording.",
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument(
+        "--recording", type=Path, metavar="MCAP", help="if it is not where data.json says, or beside it"
+    )
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="gets [stamp_offsets] (default: only report)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=_run_time)
+
+
 def _add_surveys(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("surveys", nargs="+", type=Path, metavar="SURVEY.json")
     parser.add_argument(
@@ -75,6 +91,12 @@ def _run_odometry(arguments: argparse.Namespace) -> int:
     from .rig_tool import run_odometry
 
     return run_odometry(arguments)
+
+
+def _run_time(arguments: argparse.Namespace) -> int:
+    from .time_tool import run
+
+    return run(arguments)
 
 
 def _bounds(text: str) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from . import workbench_tool
 from .errors import InputError, RobotdError
 from .lens_commands import add_calibrate_camera
-from .rig_commands import add_calibrate_rig
+from .rig_commands import add_calibrate_rig, add_calibrate_time
 from .roof_commands import add_calibrate_roof, add_roof
 
 if TYPE_CHECKING:
@@ -155,6 +155,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     add_calibrate_camera(kinds)
     add_calibrate_rig(kinds)
     add_calibrate_roof(kinds)
+    add_calibrate_time(kinds)
 
 
 def _board(text: str) -> tuple[int, int]:

@@ -62,6 +62,7 @@ def test_a_calibration_survives_the_file_to_the_last_bit(tmp_path):
         "front", (640, 480), (268.5 + 1e-13, 268.5, 319.5, 239.5), Transform((0.1, -1 / 3, 0.0), (0.06, 0, 0.5))
     )
     calibration = Calibration(
+        stamp_offsets={"front": 0.0421, "floor cam": -0.003},
         wheels=Wheels(scale_left=1.003, base=0.2351),
         cameras=(camera,),
         floor_camera=camera,

@@ -71,6 +71,7 @@ LAYERS = {
         "lens_tool",
         "rig_commands",
         "rig_tool",
+        "time_tool",
         "lens_commands",
         "calibrate",
         "doctor",

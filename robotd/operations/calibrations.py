@@ -351,4 +351,5 @@ async def _time(operations: Operations, person: _Person, wanted: Calibration) ->
         "columns": ["t", "heading", "turn_rate"],
         "rows": [(state.t, state.pose.heading, state.turn_rate) for state in rows],
     }
-    return await album.finish(f"recorded {status['file']}; odometry in {{folder}}/data.json")
+    command = f"robotd-solver calibrate time {{folder}} --calibration {robot.assembly.config.robot.calibration}"
+    return await album.finish(f"recorded {status['file']}; odometry in {{folder}}/data.json\nnow: {command}")
