@@ -53,6 +53,16 @@ def test_a_pattern_is_learnt_from_a_light_curve_to_its_stated_uncertainty(patter
     assert np.abs(np.array(learnt.pattern.on) - pattern.on).max() < 4.0 * learnt.edge_sigma
 
 
+def test_flashes_that_drift_from_between_two_exposures_into_one_are_learnt_together():
+    rng = np.random.default_rng(0)
+    times = 0.0155 + np.arange(300) / 30.0
+    share = PATTERNS[3].coverage((times - 0.3894) * 0.99956 % 1.0, 0.01, 2)
+    stamps = times + np.clip(rng.normal(0.0, 0.001, len(times)), -0.004, 0.004)
+    learnt = learn_trace(stamps, share + 0.05 * rng.normal(size=len(times))).pattern
+    assert learnt.period == pytest.approx(1.00044, abs=0.0006)
+    assert np.array(learnt.on) == pytest.approx(np.array(PATTERNS[3].on), abs=0.006)
+
+
 def test_the_dark_before_and_after_the_flashes_does_not_matter():
     learnt = learn_trace(*light_curve(FlashPattern(), 14.0, seed=3, lit=(4.0, 10.0)))
     assert learnt.pattern.period == pytest.approx(1.0, abs=0.01)

@@ -34,7 +34,7 @@ _LEAST_EXPLAINED = 0.7  # of the energy, by the fold; and by the pattern
 _CLIP = 4.0  # spreads at which a residual says that somebody stood before the label
 _SURE = 0.95  # confidence below which the answer is a refusal
 _RIVAL = 0.3  # a second place that flashes differently counts if it is so strong, relative to the first
-_ROUNDS = 2
+_ROUNDS = 6  # of refinement, at most
 _ALLOWED = 4.0  # loss above the best one's, in squared spreads, that an edge or the period may have
 _STAMPS_S = 0.002  # time stamps are off by so much
 _HUGE = 1e12
@@ -253,9 +253,14 @@ class _Fit:
         self.period_sigma = self.edge_sigma = 0.0
         self.dark = self.light = 0.0
         self.noise = float(np.std(curve))
-        for _ in range(_ROUNDS if not period else 1):
+        best = np.inf
+        for _ in range(1 if period else _ROUNDS):
             self._refine()
             self._divide()
+            loss = float((np.minimum(np.abs(self._residual()), self.light) ** 2).sum())
+            if loss > 0.98 * best:
+                break
+            best = loss
 
     # ---- period ------------------------------------------------------------------------------------------------------
 
@@ -362,18 +367,20 @@ class _Fit:
         residual = self._residual()
         floor = 0.01 * max(self.light, 1e-9)
         self.noise = max(1.48 * float(np.median(np.abs(residual))), floor)
-        spans = np.linspace(-1.0, 1.0, 33)
+        # the flashes are free to move and widen, because a period is as uncertain as they leave it
         step = 0.5 * self.pace / self.seconds * self.period
-        trials = self.period + step * spans
-        losses = np.array([self._loss(self.on, float(trial)) for trial in trials])
+        trials = self.period + step * np.linspace(-1.0, 1.0, 17)
+        losses = np.array([self._settled(float(trial))[0] for trial in trials])
         allowed = trials[losses <= losses.min() + _ALLOWED]
         middle = 0.5 * (self.times[0] + self.times[-1])
-        period = float(allowed.mean())
+        period = float(0.5 * (allowed[0] + allowed[-1]))
         shift = middle % period - middle % self.period  # so that the middle keeps its phase
-        self.on = [[start + shift, end + shift] for start, end in self.on]
+        _, on = self._settled(period)
+        self.on = [[start + shift, end + shift] for start, end in on]
         self.period, self.period_sigma = period, float(np.hypot(allowed.std(), (trials[1] - trials[0]) / 3.5))
         worst = 0.0
         reach = 0.6 * self.pace + self.exposure
+        spans = np.linspace(-1.0, 1.0, 33)
         for flash in self.on:
             for side in (0, 1):
                 trials = flash[side] + reach * spans
@@ -387,6 +394,22 @@ class _Fit:
                 flash[side] = float(allowed.mean())
                 worst = max(worst, float(np.hypot(allowed.std(), (trials[1] - trials[0]) / 3.5)))
         self.edge_sigma = float(np.hypot(worst, _STAMPS_S))
+
+    def _settled(self, period: float) -> tuple[float, list[list[float]]]:
+        """Least loss of a period, and its flashes, moved all by as much and widened all by as much."""
+        on, best = self.on, self._loss(self.on, period)
+        shortest = min(end - start for start, end in on)
+        for reach in (0.4 * self.pace, 0.1 * self.pace):
+            for early, late in ((1.0, 1.0), (-0.5, 0.5)):
+                trials = reach * np.linspace(-1.0, 1.0, 7)
+                trials = trials[shortest + (late - early) * trials > 0.004]
+                moved = [[[start + early * d, end + late * d] for start, end in on] for d in trials]
+                losses = [self._loss(trial, period) for trial in moved]
+                k = int(np.argmin(losses))
+                if losses[k] < best:
+                    best, on = losses[k], moved[k]
+                    shortest = min(end - start for start, end in on)
+        return best, on
 
     def _residual(self) -> Floats:
         self._loss(self.on, self.period)
