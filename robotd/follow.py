@@ -2,14 +2,15 @@
 
 Steering is the path's curvature plus feedback of the distance e to the path and the heading error p,
 
-    turn rate = v (curvature cos p / (1 - curvature e) - e / L^2 - 2 sin p / L),
+    turn rate = v (curvature cos p / max(1 - curvature e, 1) - e / L^2 - 2 sin p / L),
 
 which makes e die out over distance, not time, like a critically damped spring of natural length L (Samson 1995,
-"Control of chained systems"; Siciliano et al., "Robotics", section 11.6). All three are taken where the robot will be
-when the wheels obey: the wishes still on their way are known. The speed is the greatest from which the robot can still
-brake for every bend, for the stop and for the end of what is known (Bobrow et al. 1985, along a path by one backward
-pass). Wheel speeds of the base come in steps of about 28.5 mm/s, so turn rates come in steps of 0.12 rad/s; a small
-dither of the wishes makes the average linear.
+"Control of chained systems"; Siciliano et al., "Robotics", section 11.6). Samson's divisor is taken on the outer side
+of bends only: inside a tight one the nearest point of the path runs ahead, and turning after it leads farther inside.
+All three are taken where the robot will be when the wheels obey: the wishes still on their way are known. The speed is
+the greatest from which the robot can still brake for every bend, for the stop and for the end of what is known (Bobrow
+et al. 1985, along a path by one backward pass). Wheel speeds of the base come in steps of about 28.5 mm/s, so turn
+rates come in steps of 0.12 rad/s; a small dither of the wishes makes the average linear.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class FollowConfig:
     most_turn_rate: float = 1.4
     wheel_speed: float = 0.29  # of the faster wheel
     half_base: float = 0.1175  # half the distance between the wheels
-    length: float = 0.11  # over which an error of position dies out, at least
+    length: float = 0.07  # over which an error of position dies out, at least
     length_time: float = 0.45  # the same, in seconds of driving
     lag: float = 0.12  # seconds from a wish to the wheels' turning
     coast: float = 0.30  # metres on memory alone, then halt
@@ -129,7 +130,7 @@ class PathFollower:
         room = max(remaining - 0.5 * config.lag * self._speed, 0.0)
         limit = min(limit, max(math.sqrt(2.0 * config.acceleration * room), config.least))
         self._speed = min(limit, self._speed + config.acceleration * dt)
-        bent = curvature * math.cos(p) / max(1.0 - curvature * e, 0.3)
+        bent = curvature * math.cos(p) / max(1.0 - curvature * e, 1.0)
         held = min(max(e, -0.5 * length), 0.5 * length)
         turn_rate = self._speed * (bent - held / length**2 - 2.0 * math.sin(p) / length)
         turn_rate = min(max(turn_rate, -config.most_turn_rate), config.most_turn_rate)

@@ -136,6 +136,34 @@ def test_right_angles_are_followed_to_thirty_millimetres():
     assert robot.rolled.mean() == pytest.approx(3.3, abs=0.005)
 
 
+@pytest.mark.parametrize(("angle", "slip"), [(60.0, -0.14), (60.0, 0.14), (90.0, -0.14), (90.0, 0.14)])
+def test_a_wheel_that_slips_in_a_blind_corner_costs_hardly_more_than_the_slip_itself(angle, slip):
+    """The corner is out of view when a wheel slips by 33 mm; the line is seen again after half a radian of turning."""
+    out = np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
+    corner = np.array([0.6, 0.0])
+    path, robot, follower = route([(-0.4, 0), corner, corner + out], 0), Wheeled(), PathFollower()
+    before = seen = None
+    way = []
+    while robot.rolled.mean() < 1.1:
+        if before is None and robot.x > corner[0] - 0.07:
+            before = robot.pose
+            robot.x -= 0.5 * BASE * abs(slip)
+            robot.heading += slip
+            after = robot.pose
+        pose = robot.pose
+        if before is not None and seen is None:  # what odometry believes: the same way, from where it was before
+            turned = pose.heading - after.heading
+            c, s = math.cos(before.heading - after.heading), math.sin(before.heading - after.heading)
+            dx, dy = pose.x - after.x, pose.y - after.y
+            pose = Pose(before.x + c * dx - s * dy, before.y + s * dx + c * dy, before.heading + turned)
+            seen = True if turned > 0.5 else None
+        steering = follower.steer(path, pose, 2.0, lost=0.0 if seen or before is None else 0.03, dt=TICK)
+        robot.command(steering.speed, steering.turn_rate)
+        robot.advance()
+        way.append((robot.x, robot.y))
+    assert distance_to(way, path).max() < 0.028
+
+
 def test_the_robot_slows_down_for_corners_only():
     way, _ = follow(route([(-0.4, 0), (1.5, 0), (1.5, 2.0)], 0.2), Wheeled(), 2.4)
     corner = (way[:, 0] > 1.35) & (way[:, 1] < 0.15)
@@ -275,38 +303,25 @@ def test_a_line_with_corners_is_followed_from_pixels_and_stops_are_exact():
     assert driver.latest_line
 
 
-def test_right_angles_are_followed_from_pixels():
-    path = route([(-0.2, 0), (1.0, 0), (1.0, 1.4)], 0)
-    way, fault, _, _ = run_virtual(drive(path, [1.5], seed=2))
-    assert fault is None
-    assert distance_to(way[:, 1:3], path).max() < 0.045
-
-
 def test_a_closed_line_is_followed_past_its_start():
-    loop = route([(-0.2, 0), (0.5, 0), (0.5, 0.8), (-0.4, 0.8), (-0.4, 0), (0.5, 0)], 0.2)
-    way, fault, _, _ = run_virtual(drive(loop, [3.2], seed=3))
+    loop = route([(-0.2, 0), (0.5, 0), (0.5, 0.65), (-0.4, 0.65), (-0.4, 0), (0.5, 0)], 0.2)
+    way, fault, _, _ = run_virtual(drive(loop, [2.9], seed=3))
     assert fault is None
     error = distance_to(way[:, 1:3], loop)
     assert np.sqrt((error**2).mean()) < 0.010
 
 
 SPOILERS = {
-    "blank": lambda last: lambda t, image: image if t < 1.5 else np.zeros_like(image),
-    "saturated": lambda last: lambda t, image: image if t < 1.5 else np.full_like(image, 255),
-    "noise": lambda last: (
-        lambda t, image: (
-            image if t < 1.5 else np.random.default_rng(int(1e6 * t)).integers(0, 256, image.shape).astype(np.uint8)
-        )
-    ),
-    "frozen": lambda last: lambda t, image: last.setdefault("image", image) if t >= 1.5 else image,
-    "silent": lambda last: lambda t, image: image if t < 1.5 else None,
+    "noise": lambda t, image: np.random.default_rng(int(1e6 * t)).integers(0, 256, image.shape).astype(np.uint8),
+    "silent": lambda t, image: None,
 }
 
 
 @pytest.mark.parametrize("kind", SPOILERS)
 def test_useless_frames_end_as_a_lost_line_within_the_coast(kind):
-    path = route([(-0.2, 0), (4.0, 0)], 0)
-    way, fault, _, _ = run_virtual(drive(path, [3.0], spoil=SPOILERS[kind]({})))
+    path, spoilt = route([(-0.2, 0), (2.5, 0)], 0), SPOILERS[kind]
+    spoil = lambda t, image: image if t < 1.5 else spoilt(t, image)  # noqa: E731
+    way, fault, _, _ = run_virtual(drive(path, [2.0], spoil=spoil))
     assert fault is not None
     assert fault.startswith("line lost")
     blind = np.interp(1.5, way[:, 0], way[:, 1])

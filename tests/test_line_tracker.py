@@ -311,6 +311,37 @@ def test_a_crossing_line_does_not_lead_astray():
     assert tracker.path[-1, 0] > 2.2
 
 
+@pytest.mark.parametrize(
+    ("angle", "behind"), [(-110.0, 0.06), (-70.0, 0.15), (-50.0, 0.15), (60.0, 0.15), (90.0, 0.06)]
+)
+def test_a_crossing_right_before_a_gap_is_no_corner(angle, behind):
+    """One arm and then the other is taken for the trunk's own way on, until all three pieces are seen."""
+    near, across = bent(angle), np.vstack([bent(angle + 180.0)[:0:-1], bent(angle)])
+    beyond = line_along_x(length=4.0)
+    beyond = beyond[beyond[:, 0] > 1.2 + behind]
+
+    def lines(pose):
+        if pose.x < 0.3:
+            return many(np.vstack([TRUNK, near]))(pose)
+        if pose.x < 0.4:
+            return many(np.vstack([TRUNK, bent(angle + 180.0)]))(pose)
+        return many(TRUNK, across, beyond)(pose)
+
+    tracker = LineTracker(VIEW)
+    drive(tracker, None, straight_history(duration=6.0), np.arange(0.0, 4.0, 1 / 30), lines=lines)
+    assert np.abs(tracker.path[:, 1]).max() < 0.008
+    assert tracker.path[-1, 0] > 1.6
+
+
+def test_a_corner_before_another_line_is_still_a_corner():
+    """Another piece of tape lies straight on behind our right angle, but nothing crosses there."""
+    beyond = line_along_x(length=4.0)
+    lines = many(np.vstack([TRUNK, bent(90.0)]), beyond[beyond[:, 0] > 1.35])
+    tracker = LineTracker(VIEW)
+    drive(tracker, None, straight_history(duration=6.0), np.arange(0.0, 4.0, 1 / 30), lines=lines)
+    assert tracker.path[-1] == pytest.approx([1.2, 0.5], abs=0.25)
+
+
 def test_the_end_of_the_line_is_an_end_only_once_bare_floor_is_seen_beyond_it():
     tracker, path = LineTracker(VIEW), line_along_x(length=1.5)
     history = straight_history(duration=8.0)

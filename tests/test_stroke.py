@@ -1,5 +1,6 @@
 """The line detector: accuracy in all directions, what it joins, what it refuses, and its kernels against numpy."""
 
+import copy
 import tracemalloc
 from pathlib import Path
 
@@ -215,6 +216,18 @@ def test_a_reused_detector_gives_the_same_lines_and_keeps_its_buffers():
     detector.detect(np.full((H, W), 90, np.uint8))
     np.testing.assert_array_equal(detector.detect(first)[0].points, expected)
     assert {id(buffer) for buffer in detector._workspaces.values()} == buffers
+
+
+@pytest.mark.parametrize("variant", ["robotd", "thesis"])
+def test_a_kept_line_does_not_change_when_the_next_frame_is_searched(variant):
+    detector = LineDetector(LineConfig("dark", (13, 20), variant=variant))
+    kept = detector.detect(draw([[(0, 60), (299, 180)], [(20, 239), (60, 0)]], 16))
+    assert kept
+    before = copy.deepcopy(kept)
+    detector.detect(draw([[(0, 180), (150, 40), (299, 200)]], 16, seed=1))
+    for line, copied in zip(kept, before, strict=True):
+        for name in ("points", "normals", "curvature"):
+            np.testing.assert_array_equal(getattr(line, name), getattr(copied, name))
 
 
 def test_frames_leave_no_memory_behind():

@@ -24,6 +24,8 @@ LEAVES = 0.015  # m from the line's middle at which a branch leaves it
 PARALLEL = math.radians(20.0)  # branches that differ by less are one line
 BACK = math.radians(135.0)  # nobody turns by more at a junction
 STRAIGHT_ON = math.radians(37.0)  # across a gap
+BRIDGE = 0.28  # m from where the line is crossed to where it goes on behind a gap
+CROSSES = 0.08  # m to either side of that place that a crossing line shows
 VOTES = 4  # frames that must agree before the path changes
 SURE_VOTES = 8  # the same if the path as remembered is seen as well
 SURE = 0.6  # confidence of a line that may change the path
@@ -38,6 +40,7 @@ class Branch:
     points: Floats
     turn: float
     direction: float
+    behind_gap: bool = False
 
 
 class Junctions:
@@ -92,11 +95,16 @@ class Junctions:
                 own_direction = math.atan2(own[1], own[0])
                 own_turn = math.atan2(before[0] * own[1] - before[1] * own[0], float(before @ own))
                 differs = abs(math.remainder(branch.direction - own_direction, 2 * math.pi)) > PARALLEL
-                beyond = (line.lengths > branch.s + 0.04) & (line.lengths < branch.s + 0.04 + REACH)
-                is_real = bool((line.missed[beyond] < VOTES).mean() > 0.5)
+                beyond = (line.lengths > branch.s + 0.04) & (line.lengths < branch.s + 0.04 + BRIDGE + REACH)
+                seen = np.count_nonzero(line.missed[beyond] < VOTES) * line.spacing  # perhaps only behind a gap
+                is_real = seen > 0.5 * min(REACH, own_length)
                 if is_real and (not differs or score > self._score(own_turn, own_direction) - 0.1):
                     continue
+                if branch.behind_gap and not (differs and _is_crossed(sights, line.point_at(branch.s), own)):
+                    continue
                 votes = SURE_VOTES if is_real else VOTES
+            elif branch.behind_gap:
+                continue  # the end itself grows across a gap
             elif own_length > 2.5 * line.spacing and abs(branch.turn) < STRAIGHT_ON:
                 continue  # the end itself grows by what is seen beyond it
             elif self._rule == "straight" and abs(branch.turn) > STRAIGHT_ON and _goes_both_ways(branch, found):
@@ -140,8 +148,10 @@ class Junctions:
             first, s = last + 1, float(found.along[last])
         else:
             first = int(found.gap.argmin())
-            if found.gap[first] > PASSING:
-                return None
+            passes = bool(found.gap[first] <= PASSING)
+            on_ahead = _straight_on(line, sight, behind_gap=not passes)
+            if on_ahead is not None or not passes:
+                return on_ahead
             away = np.hypot(*(line.path - sight.points[first]).T)
             s = float(lengths[int(away.argmin())])
         points = sight.points[first:]
@@ -151,6 +161,37 @@ class Junctions:
         before = line.direction_at(s, -0.10)
         turn = math.atan2(before[0] * chord[1] - before[1] * chord[0], float(before @ chord))
         return Branch(s, points, turn, math.atan2(chord[1], chord[0]))
+
+
+def _straight_on(line: LineMap, sight: Sight, *, behind_gap: bool) -> Branch | None:
+    """A sight as the straight way on from where the line turns off: its beginning, prolonged backwards, lies on it."""
+    back = end_direction(sight.points[::-1], REACH)
+    bridge = sight.points[0] + np.arange(BRIDGE, 0.0, -line.spacing)[:, None] * back
+    found = nearest(bridge, line.path, 0.05, line.lengths)
+    middle = np.flatnonzero(found.on & (np.abs(found.offset) < LEAVES))
+    if len(middle) < 3 or arc_length(sight.points)[-1] < LEAST:
+        return None
+    s = float(found.along[middle[-1]]) - line.spacing  # the last one may lie on what turns off
+    before = line.direction_at(s, -0.10)
+    turn = math.atan2(before[1] * back[0] - before[0] * back[1], -float(before @ back))
+    if abs(turn) > STRAIGHT_ON:
+        return None
+    return Branch(s, sight.points, turn, math.atan2(-back[1], -back[0]), behind_gap)
+
+
+def _is_crossed(sights: Sequence[Sight], place: Floats, direction: Floats) -> bool:
+    """Whether a line runs through `place` in this direction: what turns off there is then not ours but that line's.
+
+    The crossed line's middle is often seen as a corner at first, because with a gap behind the crossing, or one arm
+    out of view, nothing else is there to go on with.
+    """
+    for sight in sights:
+        away = sight.points - place
+        along, beside = away @ direction, np.abs(away[:, 0] * direction[1] - away[:, 1] * direction[0])
+        along = along[beside < 2.0 * LEAVES + 0.1 * np.abs(along)]
+        if len(along) and along.min() < -CROSSES and along.max() > CROSSES:
+            return True
+    return False
 
 
 def _goes_both_ways(branch: Branch, found: Sequence[Branch]) -> bool:
