@@ -23,6 +23,7 @@ from .config import load_calibration
 from .errors import DriverFault, InputError
 from .records import Line
 from .vision import figures
+from .vision.evidence import believed
 from .vision.explain import explain
 from .vision.polyline import arc_length
 from .vision.stroke import LineConfig, LineDetector
@@ -67,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
             lines = everything.detect(image, valid)
             name = _name(frame, taken)
             written = _draw(arguments, name, everything, image, valid, lines, config.min_confidence)
-            sure = [line for line in lines if line.confidence >= config.min_confidence]
+            sure = believed(lines, config.min_confidence)
             results.append(_result(frame, image, sure, lines, view, written))
             _tell(results[-1])
     if arguments.json:

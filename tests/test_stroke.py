@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from robotd.records import Line
 from robotd.vision import (
     _stroke,
     cluster_reference,
@@ -18,6 +19,7 @@ from robotd.vision import (
     polyline_reference,
     stroke_reference,
 )
+from robotd.vision.evidence import believed
 from robotd.vision.polyline import arc_length
 from robotd.vision.stroke import LineConfig, LineDetector
 
@@ -228,6 +230,25 @@ def test_a_kept_line_does_not_change_when_the_next_frame_is_searched(variant):
     for line, copied in zip(kept, before, strict=True):
         for name in ("points", "normals", "curvature"):
             np.testing.assert_array_equal(getattr(line, name), getattr(copied, name))
+
+
+def test_a_doubtful_line_is_believed_only_beside_a_sure_one_of_its_width_and_colour():
+    def line(confidence, width=10.0, polarity="dark"):
+        return Line(np.zeros((2, 2)), width, confidence, polarity=polarity)
+
+    sure, alike, weak = line(0.8), line(0.2, 11.5), line(0.1)
+    wide, bright = line(0.3, 14.0), line(0.3, 10.0, "bright")
+    assert believed([sure, alike, wide, bright, weak], 0.4) == [sure, alike]
+    assert believed([alike, wide, bright], 0.4) == []
+    assert believed([sure, alike, weak], 0.0) == [sure, alike, weak]
+
+
+def test_the_other_arm_of_a_corner_seen_from_the_side_may_be_narrower_than_asked_for():
+    near, far = draw([[(20, 60), (170, 60)]], 16), draw([[(190, 90), (215, 230)]], 11, seed=1)
+    detector = LineDetector(LineConfig("dark", (13.5, 18.5)))
+    assert detector.detect(far) == []
+    widths = sorted(line.width for line in detector.detect(np.minimum(near, far)))
+    assert widths == pytest.approx([11.0, 16.0], abs=0.5)
 
 
 def test_frames_leave_no_memory_behind():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +41,10 @@ WITNESSES = {
 WEIGHTS = np.array(list(WITNESSES.values()))
 FEW = 4.0  # lines that one picture of a floor may well hold: a crossing, a fork, two parallels
 RIVAL = 1.0
+# Beside a sure line a doubtful one of its width and colour is likely more of the same tape, as weak edges that touch
+# strong ones are edges (Canny 1986); on a bare floor nothing is sure.
+SUPPORTED = 0.15  # confidence that is enough there
+SAME_WIDTH = 0.22  # by which the logarithms of two widths of one tape may differ
 
 
 def confidence(evidence: Singles, lengths: Singles, doubt: float) -> Floats:
@@ -53,6 +60,21 @@ def confidence(evidence: Singles, lengths: Singles, doubt: float) -> Floats:
         logit -= RIVAL * np.maximum(rivals - FEW, 0.0)
         sure = np.where(evidence[:, 0] > 0.0, 1.0 / (1.0 + np.exp(-logit)), 0.0)
     return np.asarray(sure)
+
+
+def believed(lines: Sequence[Line], least: float) -> list[Line]:
+    """Those that are `least` sure, and those that are less so but support one that is; in the same order."""
+    sure = [line for line in lines if line.confidence >= least]
+    return [
+        line
+        for line in lines
+        if line.confidence >= least
+        or (line.confidence >= SUPPORTED and any(_is_same_tape(line, other) for other in sure))
+    ]
+
+
+def _is_same_tape(one: Line, other: Line) -> bool:
+    return one.polarity == other.polarity and abs(math.log(one.width / other.width)) <= SAME_WIDTH
 
 
 def without_doubles(lines: list[Line]) -> list[Line]:

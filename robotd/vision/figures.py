@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Floats, Line
+from .evidence import believed
 from .explain import Explanation
 from .polyline import directions, resample
 
@@ -230,8 +231,9 @@ def found(
 ) -> Picture:
     """The lines on the picture: borders, centre, normals every 2 widths, width and confidence; refused ones thin."""
     canvas = Canvas(gray, valid, dim=0.75)
-    taken = [line for line in lines if line.confidence >= sure]
-    refused = sorted((line for line in lines if DOUBTFUL <= line.confidence < sure), key=lambda line: -line.confidence)
+    taken = believed(lines, sure)
+    refused = [line for line in lines if line.confidence >= DOUBTFUL and not any(line is one for one in taken)]
+    refused.sort(key=lambda line: -line.confidence)
     for k, line in enumerate(refused):
         canvas.line(line.points, GREY, 1)
         if k < 3:  # because more labels hide the picture
@@ -272,7 +274,7 @@ def rivals(
     otsu, _ = cv2.threshold(gray[seen].reshape(1, -1), 0.0, 255.0, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     pictures = {
         "picture": Canvas(gray, valid).titled("picture" if valid is None else "top view; hatched: out of sight"),
-        "lines": found(gray, valid, [line for line in lines if line.confidence >= sure], sure, "robotd"),
+        "lines": found(gray, valid, believed(lines, sure), sure, "robotd"),
     }
     for name, level in (("fixed threshold", fixed), ("Otsu threshold", float(otsu))):
         marked = ((gray <= level) if dark else (gray > level)) & seen

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import Camera
 from ..records import CameraModel, Line
-from .stroke import LineConfig, LineDetector
+from .stroke import WIDTH_ERROR, LineConfig, LineDetector
 from .top_view import TopView
 
 Bytes = NDArray[np.uint8]
 
 WIDTH_TOLERANCE, RELAXED_TOLERANCE = 0.25, 0.45  # the tape may be that much narrower or wider than it is said to be
+SURE_CONFIDENCE = 0.5  # of a line that may be ours, whatever else is in view
 RELAXED_CONFIDENCE = 0.25  # of a line that is searched where it is predicted, or after a loss
 DEPTH = 0.80  # m of floor, from the nearest in view on, that the top view has at least
 FARTHEST = 3.0  # m before the robot within which a camera must see floor
@@ -69,7 +70,7 @@ class LineEye:
             widths = max(width * (1.0 - tolerance), 1.0), max(width * (1.0 + tolerance), 1.0)
             return LineDetector(LineConfig(color, widths, least))  # type: ignore[arg-type]
 
-        self._detector = detector(WIDTH_TOLERANCE, 0.5)
+        self._detector = detector(WIDTH_TOLERANCE, SURE_CONFIDENCE)
         self._searcher = detector(RELAXED_TOLERANCE, RELAXED_CONFIDENCE)
         self._top: Bytes = np.empty(self.view.valid.shape, np.uint8)
         self._last: Bytes | None = None
@@ -102,11 +103,25 @@ class LineEye:
     def look(self, image: Bytes) -> list[Line]:
         """The lines of a new picture, best first, in pixels of `view`."""
         self._top = self.view.apply(image)
-        return self._detector.detect(self._top, self.view.valid)
+        return _by_themselves(self._detector, self._top, self.view.valid)
 
     def search(self, where: NDArray[np.bool_] | None = None) -> list[Line]:
         """Look again at the last picture with relaxed limits: in part of the top view (H, W), or everywhere."""
-        return self._searcher.detect(self._top, self.view.valid if where is None else where)
+        return _by_themselves(self._searcher, self._top, self.view.valid if where is None else where)
+
+
+def _by_themselves(detector: LineDetector, top: Bytes, valid: NDArray[np.bool_]) -> list[Line]:
+    """Lines that are as wide and as sure as asked for without another one beside them.
+
+    Because the memory knows better what continues our line, and a top view hardly tapers.
+    """
+    config = detector.config
+    least, greatest = config.width_px or (0.0, np.inf)
+    return [
+        line
+        for line in detector.detect(top, valid)
+        if line.confidence >= config.min_confidence and least - WIDTH_ERROR <= line.width <= greatest + WIDTH_ERROR
+    ]
 
 
 def _nearest_floor(camera: CameraModel) -> float:

@@ -24,7 +24,7 @@ from ..records import Floats, Line
 from . import join_reference, measure_reference, polyline_reference, stroke_reference
 from .cluster import dbscan
 from .cluster import kernels as clustering
-from .evidence import confidence, without_doubles
+from .evidence import SUPPORTED, believed, confidence, without_doubles
 from .polyline import SHARP, sharpened
 from .thesis_line import detect_thesis
 
@@ -78,14 +78,14 @@ class LineConfig:
         Of the line against the floor.
     width_px : (least, greatest) in pixels of the given image, or None to search all plausible widths.
     min_confidence : float
-        Lines below it are not returned.
+        Lines below it are returned only if one above it has their width and colour (`evidence.believed`).
     variant : "robotd" or "thesis"
         Ours, or the thesis's own (`thesis_line.py`), the baseline.
     """
 
     polarity: Literal["dark", "bright", "both"] = "dark"
     width_px: tuple[float, float] | None = None
-    min_confidence: float = 0.5
+    min_confidence: float = 0.4
     variant: Literal["robotd", "thesis"] = "robotd"
 
     def __post_init__(self) -> None:
@@ -254,7 +254,7 @@ class LineDetector:
             return detect_thesis(gray, mask, self.config.polarity, self.config.width_px or _plausible(gray.shape))
         self._mask = _NO_MASK if mask is None else mask
         lines = [line for level in self._levels for line in self._found(level, gray, mask)]
-        return without_doubles(lines) if len(lines) > 1 else lines
+        return believed(without_doubles(lines), self.config.min_confidence) if len(lines) > 1 else lines
 
     def _found(self, level: _Level, gray: Bytes, mask: Bytes | None) -> list[Line]:
         """What is found at one scale and is likely enough, in pixels of the given image."""
@@ -265,17 +265,32 @@ class LineDetector:
             pieces = _traced(work, strokes, level, sign)
             if pieces == 0:
                 continue
-            for path, row, sure in self._likely(work, pieces, sign, strokes):
-                if sure >= self.config.min_confidence and level.low <= row[2] <= level.high:
-                    line = _refined(work, path, row, gray, self._mask, 1.0 / level.scale, sign, sure)
-                    if self._fits(line.width):
-                        lines.append(line)
+            likely = self._likely(work, pieces, sign, strokes)
+            least = self.config.min_confidence
+            if max((sure for *_, sure in likely), default=0.0) >= least:
+                least = min(least, SUPPORTED)
+            seen = [
+                _refined(work, path, row, gray, self._mask, 1.0 / level.scale, sign, sure)
+                for path, row, sure in likely
+                if sure >= least and level.least <= row[2] <= level.greatest
+            ]
+            fitting = [line for line in seen if self._fits(line.width)]
+            lines += fitting
+            if any(line.confidence >= self.config.min_confidence for line in fitting):
+                # where a camera looks on from the side, the other arm of a corner is wider or narrower than asked for
+                lines += [
+                    line
+                    for line in seen
+                    if line.confidence >= self.config.min_confidence
+                    and not self._fits(line.width)
+                    and self._fits(line.width, MOST_TAPER)
+                ]
         return lines
 
-    def _fits(self, width: float) -> bool:
-        """Whether a line measured at full resolution is as wide as was asked for."""
+    def _fits(self, width: float, taper: float = 1.0) -> bool:
+        """Whether a line measured at full resolution is as wide as was asked for, or by `taper` off at most."""
         least, greatest = self.config.width_px or (0.0, math.inf)
-        return least - WIDTH_ERROR <= width <= greatest + WIDTH_ERROR
+        return least / taper - WIDTH_ERROR <= width <= greatest * taper + WIDTH_ERROR
 
     def _edges(self, level: _Level, gray: Bytes, mask: Bytes | None) -> tuple[_Workspace, int, float]:
         """The thin edges of one scale, in the buffers: these, how many, and the mean threshold."""
