@@ -50,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--json", action="store_true", help="print the result as one JSON object")
     demo.add_argument("--realtime", action="store_true", help="run at wall speed instead of as fast as possible")
     demo.add_argument("--roof", action="store_true", help="with two roof cameras, in a store that has none of its own")
-    demo.add_argument("--record", action="store_true", help="keep every frame and every serial byte (MCAP; large)")
+    demo.add_argument("--record", action="store_true", help="keep every frame and every serial byte (MCAP, up to 2 GB)")
     _add_doctor(commands)
     _add_sim(commands)
     _add_calibrate(commands)

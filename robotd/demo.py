@@ -12,6 +12,7 @@ import argparse
 import asyncio
 import json
 import logging
+import os
 import re
 import resource
 import secrets
@@ -29,7 +30,7 @@ from urllib.parse import quote
 
 from .bus import Bus
 from .clock import now, run_virtual, ticks
-from .config import save_calibration
+from .config import RecordingConfig, save_calibration
 from .daemon import Daemon, assemble
 from .demo_roof import DemoRoof
 from .errors import InputError, RobotdError
@@ -133,13 +134,15 @@ def demo(arguments: argparse.Namespace) -> int:
         if arguments.record:
             from .recording import FrameRecorder
 
-            recorder = stack.enter_context(FrameRecorder(out / "recording.mcap"))
+            recorder = stack.enter_context(FrameRecorder(out / "recording.mcap", _room_for_recording(out)))
         daemon = Daemon(assemble(path, SimHardware(world, tap=recorder)))
         roof = DemoRoof(world, run / "roof", run / "server") if layout.roof_cameras else None
         trail: Trail = []
         line: list[LinePoints] = []
         mission_s = _run(daemon, world, trail, line, roof, realtime=arguments.realtime, progress=sys.stderr)
         survey = _download_survey(server, layout.name, token)
+    if recorder is not None and recorder.is_full:
+        sys.stderr.write(f"{recorder.path} is full: {recorder.refused} later frames and serial bytes are not in it\n")
     return _report(
         arguments, layout, world, daemon, survey, trail=trail, line=line, mission_s=mission_s, started=started
     )
@@ -154,6 +157,19 @@ def _fresh_folder(run: Path) -> Path:
     except OSError as error:
         raise InputError(f"--out {run.parent}: cannot be written: {error.strerror}; name another folder") from error
     return run
+
+
+def _room_for_recording(folder: Path) -> int:
+    """Bytes that the demo's recording may take: [recording]'s limits, which leave room on the disk."""
+    limits = RecordingConfig()
+    state = os.statvfs(folder)
+    spare = state.f_bavail * state.f_frsize - round(1e6 * limits.keep_free_mb)
+    if spare <= 0:
+        raise InputError(
+            f"--record: {folder} is on a disk with {spare / 1e6 + limits.keep_free_mb:.0f} MB free, expected more than"
+            f" {limits.keep_free_mb:.0f} MB; make room, or name another folder with --out"
+        )
+    return min(spare, round(1e6 * limits.limit_mb))
 
 
 def _run(

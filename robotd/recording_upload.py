@@ -2,7 +2,8 @@
 
 The server acknowledges a piece when its disk has it, and the whole when its hash is right; only then is the recording
 marked as uploaded (a file beside it), and deleted if that is wanted. Sending again what the server has costs
-one question. No more than one piece is ever in memory.
+one question. No more than one piece is ever in memory. What the server refuses is offered again rarely: its limits may
+have been raised.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from .clock import in_thread
+from .clock import in_thread, now
 from .errors import InputError, UploadError
 from .files import write_atomic
-from .sender import Report, Sender, is_final
+from .sender import LONGEST, Report, Sender, is_final
 from .web import WebServer
 
 PIECE = 1 << 20  # bytes
@@ -55,22 +56,33 @@ class RecordingUploader(Sender):
         self.server = server
         self.timeout_s = timeout_s
         self.delete = delete
-        self._refused: set[str] = set()
+        self._refused: dict[str, float] = {}  # name -> loop time from which on to offer it again
 
     async def _send_all(self) -> float | None:
-        for path in await in_thread(self._waiting):
+        waiting = await in_thread(self._waiting)
+        self._refused = {path.stem: self._refused[path.stem] for path in waiting if path.stem in self._refused}
+        due: list[float] = []
+        for path in waiting:
+            again = self._refused.get(path.stem, 0.0)
+            if again > now():
+                due.append(again)
+                continue
             try:
                 await self._send(path)
             except UploadError as error:
                 if not error.permanent:
                     return self._failed(str(error))
-                self._refused.add(path.stem)  # until the next start
-                self.report(f"{path.name} is refused and stays on the robot: {error}", "error")
-        return None
+                if path.stem not in self._refused:
+                    self.report(f"{path.name} is refused and stays on the robot: {error}", "error")
+                due.append(now() + LONGEST * self.retry_s)
+                self._refused[path.stem] = due[-1]
+            else:
+                self._refused.pop(path.stem, None)
+        return max(self.retry_s, min(due) - now()) if due else None
 
     def _waiting(self) -> list[Path]:
         files = sorted(self.directory.glob("*.mcap")) if self.directory.is_dir() else []
-        return [path for path in files if path.stem not in self._refused and not uploaded_mark(path).exists()]
+        return [path for path in files if not uploaded_mark(path).exists()]
 
     async def _send(self, path: Path) -> None:
         """Bring one recording to the server; raises UploadError."""

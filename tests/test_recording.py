@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual, ticks
+from robotd.demo import _room_for_recording
 from robotd.errors import InputError
 from robotd.recorder import Progress, record
 from robotd.recording import FrameRecorder, read_contents, read_frames, read_serial, recover
@@ -210,3 +213,16 @@ def test_a_recording_that_is_cancelled_is_whole_and_a_killed_one_readable(tmp_pa
     left = read_contents(tmp_path / "cut.mcap")
     assert not left.is_whole
     assert left.frames["front"] >= 200 - 4, "a chunk of 256 kB"
+
+
+def test_the_demo_s_recording_has_the_robot_s_limits_and_leaves_room_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def room(free_mb: int) -> int:
+        monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=free_mb, f_frsize=10**6))
+        return _room_for_recording(tmp_path)
+
+    assert room(50_000) == 2_000_000_000
+    assert room(1_500) == 500_000_000
+    with pytest.raises(InputError, match=r"800 MB free, expected more than 1000 MB; make room, or name another folder"):
+        room(800)

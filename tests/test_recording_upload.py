@@ -266,17 +266,32 @@ def test_what_the_server_has_is_not_sent_again_and_goes_from_the_robot_if_that_i
     assert len(list((tmp_path / "server" / "recordings").glob("*.mcap"))) == 2
 
 
-def test_a_refused_recording_is_told_once_and_does_not_hold_up_the_others(tmp_path):
+def test_a_refused_recording_is_told_once_holds_up_no_other_and_is_offered_again(tmp_path, monkeypatch):
     a_recording(tmp_path, 1000, "a")
     a_recording(tmp_path, 1000, "b b")
     a_recording(tmp_path, 1000, "ccc")
-    told = []
+    told, refusals = [], []
+
+    async def main(port):
+        sender = uploader(tmp_path, port, told)
+        exchange = sender.server.exchange
+
+        async def strict(method, target, **more):
+            if "b%20b" in target and len(refusals) < 2:
+                refusals.append({path.stem for path in (tmp_path / "server" / "recordings").glob("*.mcap")})
+                return 413, b'{"problems": ["the recording is larger than is taken here"]}'
+            return await exchange(method, target.replace("b%20b", "b"), **more)
+
+        monkeypatch.setattr(sender.server, "exchange", strict)
+        await send_all(sender)
+
     with serving(tmp_path / "server") as port:
-        asyncio.run(send_all(uploader(tmp_path, port, told)))
-    assert next(text for text, level in told if level == "error").startswith(
-        "b b.mcap is refused and stays on the robot"
-    )
-    assert {path.stem for path in (tmp_path / "server" / "recordings").glob("*.mcap")} == {"a", "ccc"}
+        asyncio.run(main(port))
+    assert refusals == [{"a"}, {"a", "ccc"}]
+    errors = [text for text, level in told if level == "error"]
+    assert len(errors) == 1
+    assert errors[0].startswith("b b.mcap is refused and stays on the robot")
+    assert {path.stem for path in (tmp_path / "server" / "recordings").glob("*.mcap")} == {"a", "b", "ccc"}
 
 
 def test_something_else_than_our_server_takes_nothing(tmp_path):

@@ -9,7 +9,7 @@ from tests.units import check
 
 ROOT = Path(__file__).parent.parent
 SYSTEMD = ROOT / "systemd"
-UNITS = ["robotd.service", "robotd-guardian.service"]
+UNITS = ["robotd.service", "robotd-guardian.service", "robotd-roof.service"]
 
 
 def settings(unit):
@@ -51,6 +51,14 @@ def test_the_daemon_wants_the_guardian_but_does_not_go_down_with_it_and_has_no_r
     assert not [
         line for line in found if line.startswith(("Requires", "BindsTo")) or "tty" in line or "dialout" in line
     ]
+
+
+def test_the_roof_watch_is_confined_like_the_daemon_and_has_no_pins():
+    daemon, roof = (set(settings(unit)) for unit in ("robotd.service", "robotd-roof.service"))
+    confined = {line for line in daemon if line.startswith(("Protect", "Private", "Restrict", "SystemCall", "Capab"))}
+    assert len(confined) > 15
+    assert confined <= roof
+    assert not [line for line in roof if "gpio" in line or "media" in line]
 
 
 @pytest.mark.parametrize("unit", UNITS)
