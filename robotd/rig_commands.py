@@ -40,6 +40,9 @@ def add_calibrate_rig(kinds: argparse._SubParsersAction[argparse.ArgumentParser]
     )
     rig.add_argument("--radius", type=_metres, default=0.06, metavar="M", help="of --sphere (default: 0.06)")
     rig.add_argument("--height", type=_metres, default=0.5, metavar="M", help="of --sphere (default: 0.5)")
+    rig.add_argument(
+        "--roof-calibration", type=Path, metavar="FILE", help="gets the roof cameras' corrected homographies"
+    )
     rig.add_argument("--picture", type=Path, metavar="PNG", help="also draw the residuals and the rig")
     rig.set_defaults(run=_run_rig)
 

@@ -16,8 +16,10 @@ from .errors import InputError, SolverError
 from .files import check_survey, load_points, load_survey, write_atomic
 from .odometry import Wheels
 from .records import KnownLabel, Priors, Survey
-from .solver.calibrate_rig import Bounds, RigCalibration, calibrate_rig, merge, sphere, text
+from .roof.setup import load_calibrations, save_calibration
+from .solver.calibrate_rig import Bounds, RigCalibration, calibrate_rig, merge, sphere
 from .solver.rig_picture import draw_rig
+from .solver.rig_report import report
 
 LEAST_PRIOR = (2e-4, 2e-4)  # radians, metres: mounts bend by as much
 APPLIED = "corrected from the moves of"
@@ -41,6 +43,8 @@ def run_rig(arguments: argparse.Namespace) -> int:
         bounds = replace(bounds, each=arguments.each)
     if arguments.whole is not None:
         bounds = replace(bounds, whole=arguments.whole)
+    if arguments.roof_calibration is not None:
+        _check_roofs(survey, arguments)
     result = calibrate_rig(survey, bounds)
     if arguments.picture is not None:
         draw_rig(arguments.picture, result)
@@ -51,7 +55,30 @@ def run_rig(arguments: argparse.Namespace) -> int:
         priors = Priors(camera_rotation_rad=float(f"{turn:.2g}"), camera_translation_m=float(f"{shift:.2g}"))
         cameras = [camera.model for camera in result.cameras]
         save_rig(cameras, result.beacons, arguments.calibration, priors)
+    if arguments.roof_calibration is not None:
+        for roof in result.roofs:
+            known = load_calibrations(arguments.roof_calibration)[roof.name]
+            rows = tuple(tuple(row) for row in roof.covariance.tolist())
+            note = f"robotd-solver calibrate rig: +- {1e3 * roof.sigma:.1f} mm where it saw beacons"
+            known = replace(known, H_world_image=roof.H_world_image, covariance=rows, note=note)
+            save_calibration(known, arguments.roof_calibration)
     return _tell(arguments, result, before)
+
+
+def _check_roofs(survey: Survey, arguments: argparse.Namespace) -> None:
+    """Raise InputError unless the roof cameras' file holds the calibrations that the survey was made with."""
+    known, problems = load_calibrations(arguments.roof_calibration), []
+    for roof in survey.roof_cameras:
+        if roof.name not in known:
+            problems.append(f"{arguments.roof_calibration}: has no camera {roof.name}; it has {', '.join(known)}")
+        elif known[roof.name].H_world_image != roof.H_world_image:
+            problems.append(
+                f"{arguments.roof_calibration}: camera {roof.name} was calibrated anew since the survey; survey again"
+            )
+    if not survey.roof_cameras:
+        problems.append("--roof-calibration: the survey has no roof cameras")
+    if problems:
+        raise InputError(*problems)
 
 
 def run_odometry(arguments: argparse.Namespace) -> int:
@@ -118,13 +145,13 @@ def _inputs(arguments: argparse.Namespace) -> tuple[Survey, Calibration]:
 
 
 def _tell(arguments: argparse.Namespace, result: RigCalibration, before: Calibration) -> int:
-    report = text(result)
+    words = report(result)
     if arguments.report is not None:
-        write_atomic(arguments.report, report.encode())
+        write_atomic(arguments.report, words.encode())
     if arguments.json:
         print(json.dumps(_summary(result)))
     else:
-        print(report, end="")
+        print(words, end="")
     if arguments.calibration is None:
         _say("nothing was written; --calibration FILE gets the result")
     else:
@@ -170,6 +197,10 @@ def _summary(result: RigCalibration) -> dict[str, Any]:
             for name, place in result.beacons.items()
         },
         "beacon_distance": None if result.beacon_distance is None else list(result.beacon_distance),
+        "roofs": {
+            roof.name: {"H_world_image": roof.H_world_image, "moved_m": roof.moved, "sigma_m": roof.sigma}
+            for roof in result.roofs
+        },
         "odometry": {
             "scale": {"factor": result.scale.value, "sigma": result.scale.sigma},
             "turn": {"factor": result.turn.value, "sigma": result.turn.sigma},

@@ -10,9 +10,13 @@ import pytest
 from robotd.config import Calibration, load_calibration, save_calibration
 from robotd.errors import InputError, SolverError
 from robotd.files import save_survey
+from robotd.geometry.homography import apply
 from robotd.geometry.transforms import rotation_matrix, rotation_vector
 from robotd.odometry import Wheels
-from robotd.solver.calibrate_rig import Bounds, calibrate_rig, camera_to_camera, merge, sphere, text
+from robotd.roof.setup import RoofCalibration, load_calibrations
+from robotd.roof.setup import save_calibration as save_roof
+from robotd.solver.calibrate_rig import Bounds, calibrate_rig, camera_to_camera, merge, sphere
+from robotd.solver.rig_report import report
 from robotd.solver_main import main
 from tests.rig_course import CIRCLE, ROOF_BEACONS, STRAIGHT_ON, WORLD, rig_survey
 from tests.store_surveys import load, with_sightings
@@ -39,9 +43,9 @@ def test_cameras_without_overlap_are_found_although_nominal_is_off_by_ten_degree
     degrees, millimetres = rig_errors(result, cameras)
     assert degrees < 0.1
     assert millimetres < 2.0
-    report = text(result)
-    assert "whole rig, height: not observable from this survey" in report
-    assert "odometry's distances: not observable from this survey; measure two labels or use roof cameras" in report
+    words = report(result)
+    assert "whole rig, height: not observable from this survey" in words
+    assert "odometry's distances: not observable from this survey; measure two labels or use roof cameras" in words
     nominal = np.mean([camera.T_robot_camera.translation[2] for camera in survey.rig.cameras])
     found = np.mean([camera.model.T_robot_camera.translation[2] for camera in result.cameras])
     assert found == pytest.approx(nominal, abs=1e-3)
@@ -68,12 +72,28 @@ def test_known_labels_show_height_and_odometry_and_the_stated_uncertainties_hold
     assert sigma < 0.001
 
 
+def test_homographies_are_corrected_with_the_rig():
+    survey, cameras, _, _ = course(seed=5, nominal=FAR_OFF, known=12, roofs=True)
+    H = np.array(survey.roof_cameras[0].H_world_image)
+    bent = np.array([[1.003, 0.002, 0.02], [-0.001, 0.996, -0.015], [1e-4, -2e-4, 1.0]]) @ H
+    wrong = replace(survey.roof_cameras[0], H_world_image=tuple(map(tuple, bent.tolist())))
+    result = calibrate_rig(replace(survey, roof_cameras=(wrong,)))
+    roof, pixels = result.roofs[0], np.array([[b.u, b.v] for s in survey.stops for b in s.beacon_sightings])
+    off, left = (
+        np.linalg.norm(apply(np.array(M), pixels) - apply(H, pixels), axis=1).mean() for M in (bent, roof.H_world_image)
+    )
+    assert off > 0.015
+    assert left < 4.0 * roof.sigma < 0.03
+    assert left < 0.4 * off
+    assert rig_errors(result, cameras)[1] < 2.0
+
+
 def test_the_rig_stays_where_it_was_measured_along_what_turns_on_the_spot_do_not_show():
     survey, _, _, _ = course(seed=0, pattern=CIRCLE)
     result = calibrate_rig(survey, Bounds(whole=(np.radians(0.2), 0.003)))
     hidden = {mode.name: mode for mode in result.modes if not mode.is_shown}
     assert set(hidden) == {"height", "yaw"}
-    assert "whole rig, yaw: not observable from this survey" in text(result)
+    assert "whole rig, yaw: not observable from this survey" in report(result)
     assert abs(hidden["height"].change) < 1e-4
     assert abs(hidden["yaw"].change) < np.radians(0.2)
 
@@ -148,8 +168,12 @@ def test_the_commands_write_the_calibration_that_the_robot_reads(tmp_path, capsy
     save_survey(survey, tmp_path / "s.json")
     before = Calibration(cameras=survey.rig.cameras, beacons=dict(survey.rig.beacons), gamma=2.1)
     save_calibration(before, tmp_path / "c.toml")
+    roof, cov = survey.roof_cameras[0], tuple(tuple(row) for row in (1e-12 * np.eye(9)).tolist())
+    lens = (900.0, 900.0, 639.5, 479.5)
+    save_roof(RoofCalibration(roof.name, roof.size, lens, roof.H_world_image, cov, 0.65), tmp_path / "roof.toml")
     common = [str(tmp_path / "s.json"), "--calibration", str(tmp_path / "c.toml"), "--json"]
-    assert main(["calibrate", "rig", *common, "--picture", str(tmp_path / "rig.png")]) == 0
+    extra = ["--picture", str(tmp_path / "rig.png"), "--roof-calibration", str(tmp_path / "roof.toml")]
+    assert main(["calibrate", "rig", *common, *extra]) == 0
     found = json.loads(capsys.readouterr().out)
     after = load_calibration(tmp_path / "c.toml")
     assert after.gamma == 2.1
@@ -159,6 +183,12 @@ def test_the_commands_write_the_calibration_that_the_robot_reads(tmp_path, capsy
         max(one["sigma_in_rig"]["rotation_rad"] for one in found["cameras"].values()), rel=0.1
     )
     assert after.beacons["front"][0] == pytest.approx(ROOF_BEACONS["front"][0], abs=0.003)
+    seen = load_calibrations(tmp_path / "roof.toml")[roof.name]
+    assert seen.H_world_image == tuple(map(tuple, found["roofs"][roof.name]["H_world_image"]))
+    centre = np.array([[b.u, b.v] for b in survey.stops[8].beacon_sightings])
+    assert 0.0 < np.sqrt(seen.homography.to_plane(centre)[1][0, 0, 0]) < 0.02
+    assert main(["calibrate", "rig", *common, *extra]) == 2  # the survey is of before
+    assert "was calibrated anew since the survey" in capsys.readouterr().err
     assert (tmp_path / "rig.png").read_bytes()[:4] == b"\x89PNG"
     save_survey(replace(survey, rig=after.rig, priors=after.priors), tmp_path / "s.json")
     assert main(["calibrate", "odometry", *common]) == 0

@@ -15,11 +15,12 @@ import numpy as np
 
 from ..errors import InputError, SolverError
 from ..geometry.transforms import rotation_matrix, rotation_vector, transform_record
-from ..records import CameraModel, Floats, Priors, Rig, Sighting, Survey, Vector3
+from ..records import CameraModel, Floats, Matrix3, Priors, Rig, Sighting, Survey, Vector3
 from ..typed_json import many_records
 from .bundle import SQUARE
 from .problem import Problem, build_problem, stops_per_label
-from .rig_fit import Joint, Mode, joint, relative_sigma, with_nominal
+from .rig_fit import Joint, Mode, amount, joint, relative_sigma, with_nominal
+from .rig_roofs import RoofUnknowns
 from .robust import Optimum, optimise
 
 LEAST_STOPS = 4
@@ -37,12 +38,14 @@ _ODOMETRY = 0.003  # of wheels that were calibrated, where the survey does not s
 class Bounds:
     """How far things may be from where the survey has them, as standard deviations (radians, metres).
 
-    `each` of each camera's place on the robot, `whole` of the rig's as one, `beacons` of each beacon's x and y.
+    `each` of each camera's place on the robot, `whole` of the rig's as one, `beacons` of each beacon's x and y, and
+    `roofs` of where roof cameras see beacons, as far as their homographies are wrong.
     """
 
     each: tuple[float, float] = (float(np.radians(10.0)), 0.05)
     whole: tuple[float, float] = (float(np.radians(0.5)), 0.003)
     beacons: float = 0.01
+    roofs: float = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +79,21 @@ class Factor:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RoofFit:
+    """A roof camera's homography as the survey corrects it.
+
+    `moved` and `sigma` are metres in the plane of the beacons, rms over where it saw them; what all roof cameras and
+    the world have in common is as it was given. `covariance` (9, 9) is that of the inverse's numbers at unit norm.
+    """
+
+    name: str
+    H_world_image: Matrix3
+    covariance: Floats
+    moved: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RigCalibration:
     """What a rig's calibration found.
 
@@ -87,6 +105,8 @@ class RigCalibration:
     beacons : dict of name to position, and `beacon_sigmas` of name to the larger standard deviation of x and y
         Only those that roof cameras saw; heights are as given.
     beacon_distance : (metres, standard deviation) or None
+    roofs : tuple of RoofFit
+        Of those that saw a beacon.
     scale, turn : Factor
         Of odometry's distances and of its turns.
     stops, known : int
@@ -101,6 +121,7 @@ class RigCalibration:
     beacons: dict[str, Vector3]
     beacon_sigmas: dict[str, float]
     beacon_distance: tuple[float, float] | None
+    roofs: tuple[RoofFit, ...]
     scale: Factor
     turn: Factor
     stops: int
@@ -207,7 +228,7 @@ def calibrate_rig(survey: Survey, bounds: Bounds = Bounds(), *, free: bool = Tru
         optimum = optimise(problem)
         if optimum.problem.frame != problem.frame or not optimum.placed.all():
             # known labels are hard to match, and legs to join, while cameras look elsewhere than they are thought to
-            found, _ = joint(optimum, bounds.beacons)
+            found, *_ = joint(optimum, (bounds.beacons, bounds.roofs))
             optimum = optimise(build_problem(_loosened(_at(survey, found), bounds)))
         explained = _explained(optimum)
         if explained < _FITS:
@@ -215,15 +236,18 @@ def calibrate_rig(survey: Survey, bounds: Bounds = Bounds(), *, free: bool = Tru
                 f"only {100 * explained:.0f} % of the sightings fit any rig near the given one; check which camera is "
                 "which (rig.cameras, cables), the lenses and the labels' ids, or give --sphere for a start"
             )
-        found, optimum = joint(optimum, bounds.beacons)
+        found, optimum, unknowns, spread = joint(optimum, (bounds.beacons, bounds.roofs))
     found, modes = with_nominal(found, nominal, bounds.each, bounds.whole)
     conflicts = tuple(
-        f"the survey puts the rig's {mode.name} {_amount(mode.name, abs(mode.change))} from where it was measured "
+        f"the survey puts the rig's {mode.name} {amount(mode.name, abs(mode.change))} from where it was measured "
         "(the measured value was not used)"
         for mode in modes
         if mode.contradicts
     )
-    result = _result(problem, optimum, found, modes, nominal, bounds)
+    result = replace(
+        _result(problem, optimum, found, modes, nominal, bounds),
+        roofs=tuple(_roof(unknowns, spread, r) for r in np.unique(unknowns.roof).tolist()),
+    )
     if free and (vague := _vague(result)):
         raise SolverError("; ".join(vague))
     notes = (*optimum.problem.notes, *_left_out(optimum), *_exchanged(found, nominal, survey.rig.cameras), *conflicts)
@@ -396,6 +420,7 @@ def _result(
         beacons,
         sigmas,
         distance,
+        (),
         scale if problem.frame != "first stop" else Factor(None, asked.survey.priors.odometry_scale),
         turns,
         int(np.count_nonzero(optimum.placed)),
@@ -408,6 +433,14 @@ def _result(
 def _factor(value: float, variance: float, prior: float) -> Factor:
     sigma = float(np.sqrt(variance))
     return Factor(1.0 + float(value) if sigma < 0.5 * prior else None, sigma)
+
+
+def _roof(unknowns: RoofUnknowns, covariance: Floats, r: int) -> RoofFit:
+    H = np.linalg.inv(unknowns.homographies[r])
+    (a, b, c), (d, e, f), (g, h, i) = (H / H[2, 2]).tolist()
+    moved, sigma = unknowns.roof_sigma(covariance, r)
+    rows = (a, b, c), (d, e, f), (g, h, i)
+    return RoofFit(unknowns.names[r], rows, unknowns.matrix_covariance(covariance, r), moved, sigma)
 
 
 def _beacons(
@@ -434,54 +467,8 @@ def _beacons(
     return places, sigmas, (length, float(np.sqrt(J @ found.covariance @ J)))
 
 
-def _amount(name: str, value: float) -> str:
-    return f"{np.degrees(value):.2f} degrees" if name in ("roll", "pitch", "yaw") else f"{1e3 * value:.1f} mm"
-
-
 def camera_to_camera(cameras: Sequence[CameraModel]) -> tuple[Floats, Floats]:
     """Poses of all cameras in the axes of the first, rotations (C, 3, 3) and translations (C, 3): no common motion."""
     R = rotation_matrix([camera.T_robot_camera.rotation for camera in cameras])
     t = np.array([camera.T_robot_camera.translation for camera in cameras])
     return R[0].T @ R, (t - t[0]) @ R[0]
-
-
-def text(result: RigCalibration) -> str:
-    """The calibration for a reader, one statement a line."""
-    sightings = sum(len(camera.seen) for camera in result.cameras)
-    lines = [
-        f"{result.stops} stops, {result.known} known labels, {sightings} sightings used "
-        f"({100 * result.explained:.0f} % of what several stops saw)"
-    ]
-    for camera in result.cameras:
-        turn, place = camera.rig_sigma
-        wide, far = camera.robot_sigma
-        lines.append(
-            f"camera {camera.model.name}: {np.degrees(camera.moved[0]):.2f} degrees and {1e3 * camera.moved[1]:.1f} mm "
-            f"from nominal; in the rig +- {np.degrees(turn):.3f} degrees, +- {1e3 * place:.2f} mm; on the robot +- "
-            f"{np.degrees(wide):.3f} degrees, +- {1e3 * far:.2f} mm; {len(camera.seen)} sightings of {camera.labels} "
-            f"labels, {camera.rms_px:.2f} px rms"
-        )
-    for mode in result.modes:
-        shown = "nothing" if np.isinf(mode.survey) else f"+- {_amount(mode.name, mode.survey)}"
-        if mode.is_shown:
-            lines.append(
-                f"whole rig, {mode.name}: moved by {_amount(mode.name, mode.change)}, +- "
-                f"{_amount(mode.name, mode.sigma)} (the survey alone: {shown})"
-            )
-        else:
-            lines.append(
-                f"whole rig, {mode.name}: not observable from this survey (it shows {shown}); kept as measured by "
-                f"tape, +- {_amount(mode.name, mode.sigma)}"
-            )
-    for name, (x, y, _) in result.beacons.items():
-        lines.append(f"beacon {name}: x {x:.4f}, y {y:.4f} m, +- {1e3 * result.beacon_sigmas[name]:.1f} mm")
-    if result.beacon_distance is not None:
-        length, sigma = result.beacon_distance
-        lines.append(f"distance of the beacons: {length:.4f} m +- {1e3 * sigma:.1f} mm")
-    for what, factor in (("distances", result.scale), ("turns", result.turn)):
-        if factor.value is None:
-            why = "measure two labels or use roof cameras" if what == "distances" else "make more turns"
-            lines.append(f"odometry's {what}: not observable from this survey; {why}")
-        else:
-            lines.append(f"odometry's {what} must be multiplied by {factor.value:.5f} +- {factor.sigma:.5f}")
-    return "\n".join([*lines, *(f"note: {note}" for note in result.notes)]) + "\n"

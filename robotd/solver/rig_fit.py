@@ -12,15 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import SolverError
-from ..geometry.transforms import pose_matrix, rotation_matrix, rotation_vector, skew
+from ..geometry.transforms import rotation_matrix, rotation_vector, skew
 from ..records import Floats
 from .bundle import SQUARE, Adjustment
-from .problem import CAMERA, ODOMETRY, STOP, Ints, Problem, State
+from .problem import CAMERA, ODOMETRY, STOP, State
+from .rig_roofs import RoofUnknowns
 from .robust import Optimum
 
 COMMON = ("forward", "left", "height", "roll", "pitch", "yaw")  # metres, then radians about the rig's middle
 _MOST_COLUMNS = 6000  # of a dense inverse: 300 MB
-_SETTLED_M = 1e-6  # step of the beacons at which they are found
+_SETTLED = 1e-4  # step of beacons and homographies in their standard deviations at which they are found
+_MOST_STEPS = 12
 _CONTRADICTION = 4.0  # standard deviations between what a survey shows and where it was measured
 
 
@@ -70,85 +72,76 @@ class Mode:
         return self.contradicts or self.survey < self.nominal
 
 
-def joint(optimum: Optimum, beacon_sigma: float) -> tuple[Joint, Optimum]:
-    """Estimate the beacons together with all that an optimum holds.
+def joint(optimum: Optimum, sigmas: tuple[float, float]) -> tuple[Joint, Optimum, RoofUnknowns, Floats]:
+    """Estimate beacons and homographies together with all that an optimum holds.
 
-    The beacons are no unknowns of the adjustment: they are found by Gauss-Newton steps on the normal equations that
-    include them, with the adjustment solved anew after each (variable projection; thesis equation 43).
+    They are no unknowns of the adjustment: they are found by Gauss-Newton steps on the normal equations that include
+    them, with the adjustment solved anew after each (variable projection; thesis equations 36 and 43).
 
     Parameters
     ----------
     optimum : Optimum
-    beacon_sigma : float
-        Standard deviation of the beacons' given x and y in metres.
+    sigmas : (float, float)
+        Standard deviations of the beacons' given x and y, and of the roof cameras' planes, in metres.
 
     Returns
     -------
     Joint
     Optimum
-        With state and beacons moved.
+        With state, beacons and homographies moved.
+    RoofUnknowns
+    (2 B + 8 R,) square array
+        Their covariance.
 
     Raises
     ------
     SolverError
         If the survey is too large for a dense covariance, or says nothing about some camera.
     """
-    given = np.array(list(optimum.problem.survey.rig.beacons.values())).reshape(-1, 3)
-    which = _which(optimum.problem, given)
-    beacons = given.copy()
-    for _ in range(12):
-        H, gradient = _normal(optimum, which, beacons, given, beacon_sigma)
-        if len(which) == 0:
+    unknowns = RoofUnknowns.of(optimum.problem, optimum.state, *sigmas)
+    extra = len(unknowns)
+    for _ in range(_MOST_STEPS):
+        H, gradient = _normal(optimum, unknowns)
+        if len(unknowns.beacon) == 0:
             break
-        step = -np.linalg.solve(H, gradient)[-2 * len(given) :].reshape(-1, 2)
-        beacons[:, :2] += step
-        optimum = _moved(optimum, beacons[which])
-        if np.abs(step).max() < _SETTLED_M:
-            H, _ = _normal(optimum, which, beacons, given, beacon_sigma)
+        step = np.asarray(-np.linalg.solve(H, gradient)[-extra:], dtype=np.float64)
+        if np.abs(step / unknowns.sigma).max() < _SETTLED:
             break
+        unknowns = unknowns.moved(step)
+        optimum = _moved(optimum, unknowns)
     problem, corrections = optimum.problem, optimum.problem.camera_entries(optimum.state)
     cameras, base = len(problem.cameras), STOP * problem.stop_count
     rotation = problem.R_robot_camera @ rotation_matrix(corrections[:, :3])
-    column = np.full(len(problem.prior_sigma) + 2 * len(given), -1)
-    column[np.append(problem.free, np.ones(2 * len(given), dtype=np.bool_))] = np.arange(len(H))
+    column = np.full(len(problem.prior_sigma) + extra, -1)
+    column[np.append(problem.free, np.ones(extra, dtype=np.bool_))] = np.arange(len(H))
     rig = (base + CAMERA * np.arange(cameras)[:, None] + np.arange(6)).ravel()
     factors = base + CAMERA * cameras + np.arange(ODOMETRY)
-    wanted = column[np.concatenate([rig, factors, len(problem.prior_sigma) + np.arange(2 * len(given))])]
-    covariance = np.zeros((len(wanted), len(wanted)))
+    wanted = column[np.concatenate([rig, factors, len(problem.prior_sigma) + np.arange(2 * len(unknowns.given))])]
+    covariance, full = np.zeros((len(wanted), len(wanted))), _inverse(H)
     there = wanted >= 0
-    covariance[np.ix_(there, there)] = _inverse(H)[np.ix_(wanted[there], wanted[there])]
+    covariance[np.ix_(there, there)] = full[np.ix_(wanted[there], wanted[there])]
     turn = np.eye(len(wanted))  # corrections are about the camera's axes
     for c in range(cameras):
         turn[6 * c : 6 * c + 3, 6 * c : 6 * c + 3] = rotation[c]
-    return (
-        Joint(
-            rotation,
-            problem.t_robot_camera + corrections[:, 3:6],
-            optimum.state.frame[factors],
-            beacons,
-            turn @ covariance @ turn.T,
-        ),
-        optimum,
+    found = Joint(
+        rotation,
+        problem.t_robot_camera + corrections[:, 3:6],
+        optimum.state.frame[factors],
+        unknowns.beacons,
+        turn @ covariance @ turn.T,
     )
+    return found, optimum, unknowns, full[len(full) - extra :, len(full) - extra :]
 
 
-def _which(problem: Problem, given: Floats) -> Ints:
-    """Which beacon each roof sighting shows."""
-    distance = np.linalg.norm(problem.roofs.beacon[:, None] - given[None], axis=2)
-    return np.argmin(distance, axis=1) if len(given) else np.zeros(0, dtype=np.int64)
-
-
-def _moved(optimum: Optimum, beacon: Floats) -> Optimum:
-    problem = replace(optimum.problem, roofs=replace(optimum.problem.roofs, beacon=beacon))
+def _moved(optimum: Optimum, unknowns: RoofUnknowns) -> Optimum:
+    problem = replace(optimum.problem, roofs=unknowns.applied(optimum.problem.roofs))
     adjustment = Adjustment(problem, optimum.adjustment.sightings)
     solution = adjustment.solve(optimum.state, SQUARE, iterations=30, tolerance=1e-6, damping=1e-8)
     return replace(optimum, problem=problem, adjustment=adjustment, state=solution.state)
 
 
-def _normal(
-    optimum: Optimum, which: Ints, beacons: Floats, given: Floats, beacon_sigma: float
-) -> tuple[Floats, Floats]:
-    """Normal matrix and gradient of the free frame entries, with the points eliminated, and of the beacons' x, y.
+def _normal(optimum: Optimum, unknowns: RoofUnknowns) -> tuple[Floats, Floats]:
+    """Normal matrix and gradient of the free frame entries, with the points eliminated, and of the roof's unknowns.
 
     The rig is taken as nominal where it is, so that its corrections are small rotations about the camera's own axes.
     """
@@ -170,26 +163,21 @@ def _normal(
     normal = adjustment.normal(linear, state, SQUARE)
     S, _, WV = adjustment.eliminate(normal)
     reduced = normal.frame_gradient - WV @ normal.point_gradient.ravel()
-    n, extra = len(S), 2 * len(given)
+    n, extra = len(S), len(unknowns)
     H, gradient = np.zeros((n + extra, n + extra)), np.zeros(n + extra)
     H[:n, :n], gradient[:n] = S, reduced
-    if len(which):
-        R = pose_matrix(*problem.stop_entries(state).T)[problem.roofs.stop, :3, :3]
-        by_beacon = linear.roof_by_stop[:, :, :2] @ R[:, :2, :2]
-        columns = adjustment.columns[STOP * problem.roofs.stop[:, None] + np.arange(STOP)]
-        for k, beacon in enumerate(which.tolist()):
-            J = np.zeros((2, n + extra))
-            mine = n + 2 * beacon
-            J[:, mine : mine + 2] = by_beacon[k]
-            kept = columns[k] >= 0
-            J[:, columns[k][kept]] = linear.roof_by_stop[k][:, kept]
-            block = J.T @ J
-            block[:n, :n] = 0.0  # the stops' own part is in S
-            H += block
-            gradient[n:] += J[:, n:].T @ linear.roof[k]
+    if len(unknowns.beacon):
+        own = unknowns.jacobian(problem, state, linear.roof_by_stop).reshape(-1, extra)
+        columns = np.repeat(adjustment.columns[STOP * problem.roofs.stop[:, None] + np.arange(STOP)], 2, axis=0)
+        by_frame = np.zeros((len(own), n + 1))  # the last column takes what is held fixed
+        np.put_along_axis(by_frame, np.where(columns < 0, n, columns), linear.roof_by_stop.reshape(-1, STOP), axis=1)
+        H[:n, n:] = by_frame[:, :n].T @ own
+        H[n:, :n] = H[:n, n:].T
+        H[n:, n:] = own.T @ own
+        gradient[n:] = own.T @ linear.roof.ravel()
     diagonal = np.arange(n, n + extra)
-    H[diagonal, diagonal] += 1.0 / beacon_sigma**2
-    gradient[n:] += (beacons - given)[:, :2].ravel() / beacon_sigma**2
+    H[diagonal, diagonal] += 1.0 / unknowns.sigma**2
+    gradient[n:] += unknowns.values / unknowns.sigma**2
     return H, gradient
 
 
@@ -303,3 +291,8 @@ def relative_sigma(found: Joint, bounds: tuple[float, float]) -> tuple[Floats, F
         np.sqrt(np.maximum(np.linalg.eigvalsh(turn)[:, -1], 0.0)),
         np.sqrt(np.maximum(np.linalg.eigvalsh(place)[:, -1], 0.0)),
     )
+
+
+def amount(name: str, value: float) -> str:
+    """How far the rig moves along one of `COMMON`, in words."""
+    return f"{np.degrees(value):.2f} degrees" if name in COMMON[3:] else f"{1e3 * value:.1f} mm"

@@ -1,0 +1,54 @@
+"""A rig's calibration in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .calibrate_rig import RigCalibration
+from .rig_fit import amount
+
+
+def report(result: RigCalibration) -> str:
+    """The calibration for a reader, one statement a line."""
+    sightings = sum(len(camera.seen) for camera in result.cameras)
+    lines = [
+        f"{result.stops} stops, {result.known} known labels, {sightings} sightings used "
+        f"({100 * result.explained:.0f} % of what several stops saw)"
+    ]
+    for camera in result.cameras:
+        turn, place = camera.rig_sigma
+        wide, far = camera.robot_sigma
+        lines.append(
+            f"camera {camera.model.name}: {np.degrees(camera.moved[0]):.2f} degrees and {1e3 * camera.moved[1]:.1f} mm "
+            f"from nominal; in the rig +- {np.degrees(turn):.3f} degrees, +- {1e3 * place:.2f} mm; on the robot +- "
+            f"{np.degrees(wide):.3f} degrees, +- {1e3 * far:.2f} mm; {len(camera.seen)} sightings of {camera.labels} "
+            f"labels, {camera.rms_px:.2f} px rms"
+        )
+    for mode in result.modes:
+        shown = "nothing" if np.isinf(mode.survey) else f"+- {amount(mode.name, mode.survey)}"
+        if mode.is_shown:
+            lines.append(
+                f"whole rig, {mode.name}: moved by {amount(mode.name, mode.change)}, +- "
+                f"{amount(mode.name, mode.sigma)} (the survey alone: {shown})"
+            )
+        else:
+            lines.append(
+                f"whole rig, {mode.name}: not observable from this survey (it shows {shown}); kept as measured by "
+                f"tape, +- {amount(mode.name, mode.sigma)}"
+            )
+    for name, (x, y, _) in result.beacons.items():
+        lines.append(f"beacon {name}: x {x:.4f}, y {y:.4f} m, +- {1e3 * result.beacon_sigmas[name]:.1f} mm")
+    if result.beacon_distance is not None:
+        length, sigma = result.beacon_distance
+        lines.append(f"distance of the beacons: {length:.4f} m +- {1e3 * sigma:.1f} mm")
+    lines += [
+        f"roof camera {roof.name}: homography moved by {1e3 * roof.moved:.1f} mm, +- {1e3 * roof.sigma:.1f} mm"
+        for roof in result.roofs
+    ]
+    for what, factor in (("distances", result.scale), ("turns", result.turn)):
+        if factor.value is None:
+            why = "measure two labels or use roof cameras" if what == "distances" else "make more turns"
+            lines.append(f"odometry's {what}: not observable from this survey; {why}")
+        else:
+            lines.append(f"odometry's {what} must be multiplied by {factor.value:.5f} +- {factor.sigma:.5f}")
+    return "\n".join([*lines, *(f"note: {note}" for note in result.notes)]) + "\n"
