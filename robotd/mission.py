@@ -181,7 +181,7 @@ class Mission(Steps):
                 self._tell("fault", self.ended)
                 self._say(self.ended, "error")
             finally:
-                self.is_over = True
+                self.is_over, self._pause = True, None
         try:
             await in_thread(self.journal.end_mission, self._id, self.ended or "done")
         except StorageError as error:

@@ -55,8 +55,8 @@ class MissionKeeper:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether there is a mission that has not ended, or whose map is still awaited."""
-        return self._is_starting or (self._running is not None and not self._running.done())
+        """Whether there is a mission that has not ended; its map may still be awaited then."""
+        return self._is_starting or (self.mission is not None and not self.mission.is_over)
 
     async def start(self, *, survey: str | None = None, first_stop: int = 1) -> None:
         """Begin a mission that an operator attends; a MissionError or InputError says why not."""
@@ -81,7 +81,8 @@ class MissionKeeper:
             await self._begin(None, is_attended=False)
             self._run()
         assert self._running is not None
-        await self._running
+        while not self._running.done():  # another one may take its place while its map is awaited
+            await asyncio.wait({self._running})
 
     async def restore(self) -> None:
         """Begin again, paused, the mission that was interrupted when the last daemon ended, if one was."""
@@ -198,6 +199,8 @@ class MissionKeeper:
 
     def _run(self) -> None:
         assert self.mission is not None
+        if self._running is not None:
+            self._running.cancel()  # nobody waits for the map of the one before any more
         self._running = self.daemon.spawn(self._run_mission(self.mission))
 
     async def _run_mission(self, mission: Mission) -> None:

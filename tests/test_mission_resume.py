@@ -4,6 +4,7 @@ import asyncio
 import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -223,6 +224,22 @@ def test_whenever_it_is_interrupted_every_stop_is_made_once(tmp_path, seed):
 
     lives(tmp_path, start, *map(wait, times[1:]), finish, resume="auto", stops=(0.0, 0.6, 1.2))
     assert sorted(stop for _, stop in stops_in(tmp_path)) == [1, 2, 3]
+
+
+def test_another_mission_may_begin_while_the_map_of_the_last_one_is_awaited(tmp_path):
+    async def scenario(robot, client):
+        never = asyncio.Event()
+        robot.daemon.missions._fetch_map = lambda mission, uploader: never.wait()
+        robot.daemon.uploader = SimpleNamespace(wake=lambda: None, trouble=None)
+        await client.call("mission.start")
+        await robot.until("uploading")
+        assert "no mission is under way" in (await client.call("mission.abort"))["message"]
+        assert (await client.call("mission.start", survey="next"))["leg"] == 1
+        await robot.until("observing", 1)
+        await robot.until("uploading")
+
+    (robot,) = lives(tmp_path, scenario, stops=(0.0,))
+    assert robot.daemon.mission.config.survey == "next"
 
 
 # ---- what is remembered ----------------------------------------------------------------------------------------------

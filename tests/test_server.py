@@ -16,6 +16,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import quote
@@ -87,7 +88,9 @@ def running(store, token=TOKEN, solve=fake_solve):
         assert started.wait(20)
         port = listener.getsockname()[1]
         try:
-            yield lambda *args, **kwargs: ask(port, *args, **kwargs)
+            request = partial(ask, port)
+            request.port = port
+            yield request
         finally:
             server.should_exit = True
             thread.join()

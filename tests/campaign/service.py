@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.robot_process import PUSHING, install_drivers
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = "python3,python3-venv,systemd,systemd-sysv,dbus,udev"
 TOOLS = ("debootstrap", "systemd-nspawn")
@@ -32,48 +34,6 @@ driver = "trial_camera"
 driver = "trial_follower"
 [drivers.labels]
 driver = "trial_labels"
-"""
-
-# an outsider's package of drivers: a follower that wants to drive straight on, and what a configuration must have
-DRIVERS = """
-from dataclasses import dataclass
-
-from robotd.clock import now, ticks
-from robotd.plugin import Driver
-from robotd.records import DriveCommand
-
-
-@dataclass(frozen=True)
-class Empty:
-    pass
-
-
-@dataclass(frozen=True)
-class FollowerConfig:
-    camera: str = "eye"
-
-
-class Camera(Driver):
-    kind, Config = "camera", Empty
-
-
-class Labels(Driver):
-    kind, Config = "labels", Empty
-
-
-class Follower(Driver):
-    kind, Config = "follower", FollowerConfig
-    blind = 0.3
-
-    async def run(self):
-        async for _ in ticks(0.03):
-            self.bus.commands.publish(DriveCommand(now(), 0.2, 0.0, self.name))
-"""
-ENTRY_POINTS = """
-[robotd.drivers]
-trial_camera = trial_drivers:Camera
-trial_labels = trial_drivers:Labels
-trial_follower = trial_drivers:Follower
 """
 
 FILES = {
@@ -263,11 +223,7 @@ def install(tree, folder):
     shutil.copy(ROOT / "systemd" / "robotd-sysusers.conf", tree / "etc" / "sysusers.d" / "robotd.conf")
     inside(tree, "systemd-sysusers")
     site = tree / "opt" / "robotd" / "lib" / "python3.11" / "site-packages"
-    (site / "trial_drivers.py").write_text(DRIVERS)
-    info = site / "trial_drivers-1.0.dist-info"
-    info.mkdir(exist_ok=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: trial-drivers\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    install_drivers(site, PUSHING)
     for name, text in FILES.items():
         path = tree / name
         path.parent.mkdir(parents=True, exist_ok=True)
