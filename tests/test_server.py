@@ -241,7 +241,7 @@ def test_a_body_that_was_damaged_on_the_way_is_refused(server):
 
 
 def test_a_client_that_leaves_in_the_middle_does_no_harm(store, server):
-    port = server.__closure__[0].cell_contents
+    port = server.port
     with socket.create_connection(("127.0.0.1", port), 10) as line:
         line.sendall(
             f"PUT {ROOM} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {TOKEN}\r\nContent-Length: 999\r\n\r\n{{".encode()
