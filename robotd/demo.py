@@ -43,8 +43,9 @@ from .sim.roof import PINS, with_roof_cameras
 from .sim.stores import find_store, load_store
 from .sim.world import World, WorldSettings, load_settings
 from .solver import solve
+from .solver.evaluate import text_table
 from .solver.line_world import line_in_world, runs, save_line_csv
-from .solver.report import map_html, map_png, text_table
+from .solver.report import map_html, map_png
 
 Trail = list[tuple[float, float]]
 
@@ -378,7 +379,7 @@ def _report(
     if arguments.json:
         print(json.dumps(result))
         return 0
-    print(text_table({"bundle adjustment": bundle_score, "linear triangulation": linear_score}))
+    print(text_table([bundle_score, linear_score]))
     print(f"line: {cross_track['rms']:.1f} mm rms, {cross_track['max']:.1f} mm at most off the tape's centre")
     spent = f"wall {wall_s:.0f} s; peak memory {peak_mb:.0f} MB"
     print(f"mission {mission_s / 60:.1f} min (virtual), {len(survey.stops)} stops; {spent}")

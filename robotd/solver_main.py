@@ -13,6 +13,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,8 +76,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     solve.set_defaults(run=_solve)
 
-    evaluate = commands.add_parser("evaluate", help="compare a map with the truth")
-    evaluate.add_argument("map", type=Path, metavar="MAP.json")
+    evaluate = commands.add_parser("evaluate", help="compare maps with the truth")
+    evaluate.add_argument("maps", nargs="+", type=Path, metavar="MAP.json")
     evaluate.add_argument("--truth", type=Path, metavar="CSV", required=True, help="label,x,y,z in metres")
     evaluate.add_argument(
         "--align",
@@ -84,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
         default="none",
         help="move the map onto the truth first, in the plane or in space",
     )
-    evaluate.add_argument("--json", action="store_true", help="print one JSON object")
+    evaluate.add_argument("--json", action="store_true", help="print one JSON object; of several maps a list")
     evaluate.set_defaults(run=_evaluate)
 
     check = commands.add_parser("check", help="name every mistake in a survey")
@@ -284,27 +285,31 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from .config import collect
     from .files import load_map, load_points
     from .solver import evaluate
-    from .solver.report import text_table
+    from .solver.evaluate import text_table
 
     problems: list[str] = []
-    result = collect(problems, lambda: load_map(arguments.map))
+    results = [collect(problems, partial(load_map, path)) for path in arguments.maps]
     points = collect(problems, lambda: load_points(arguments.truth))
-    if result is None or points is None:
+    if problems or points is None:
         raise InputError(*problems)
     truth = {label: position for label, (position, _) in points.items()}
-    evaluation = evaluate(result, truth, align=arguments.align)
+    evaluations = [evaluate(result, truth, align=arguments.align) for result in results if result is not None]
     if arguments.json:
-        print(
-            json.dumps(
-                {
-                    "labels_total": evaluation.labels_total,
-                    "labels_placed": evaluation.labels_placed,
-                    "error_mm": evaluation.error_mm,
-                }
-            )
-        )
+        rows = [
+            {
+                "labels_total": one.labels_total,
+                "labels_placed": one.labels_placed,
+                "labels_within_95": one.labels_within,
+                "error_mm": one.error_mm,
+                "known_points": one.known_points,
+                "localisation": one.localisation,
+                "method": one.method,
+            }
+            for one in evaluations
+        ]
+        print(json.dumps(rows[0] if len(rows) == 1 else rows))
     else:
-        print(text_table({result.solver.method: evaluation}))
+        print(text_table(evaluations))
     return 0
 
 

@@ -22,8 +22,8 @@ from robotd.records import (
     Survey,
     Transform,
 )
-from robotd.solver.evaluate import Evaluation, evaluate
-from robotd.solver.report import map_html, map_png, text_table
+from robotd.solver.evaluate import Evaluation, evaluate, text_table
+from robotd.solver.report import map_html, map_png
 
 NASTY = "</script><b>&\"'$x^{$\n\u2028\ud7ff"
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
@@ -163,11 +163,15 @@ def test_no_name_can_break_out_of_the_page(tmp_path):
 
 def test_the_table_has_one_row_per_method():
     some = evaluate(a_map(), {"A": (0.0, 1.5, 0.81), "B": (1.0, 1.53, 0.8), "D": (0.0, 0.0, 0.0)})
-    none = Evaluation(3, 0, 0, dict.fromkeys(("mean", "median", "p95", "max")), {})
-    lines = text_table({"bundle adjustment": some, "linear": none}).splitlines()
-    assert lines[0].split() == ["method", "labels", "mean", "median", "95", "%", "max"]
-    assert lines[2].split() == ["bundle", "adjustment", "2", "/", "3", "20.0", "20.0", "29.0", "30.0"]
-    assert lines[3].split() == ["linear", "0", "/", "3", "-", "-", "-", "-"]
+    none = Evaluation(
+        3, 0, 0, dict.fromkeys(("mean", "median", "p95", "max")), {}, None, 4, "roof cameras", "linear (SVD)"
+    )
+    lines = text_table([some, none]).splitlines()
+    assert lines[0].split("  ")[0] == "known points"
+    assert lines[1].split() == [
+        *("0", "dead", "reckoning", "bundle", "adjustment", "2", "/", "3", "20.0", "20.0", "29.0", "30.0")
+    ]
+    assert lines[2].split() == ["4", "roof", "cameras", "linear", "(SVD)", "0", "/", "3", "-", "-", "-", "-"]
     assert len({len(line) for line in lines}) == 1
 
 

@@ -96,11 +96,22 @@ def test_known_labels_come_from_a_table_and_replace_those_of_the_survey(files):
 
 def test_evaluate_prints_the_errors_as_a_table_or_as_json(files, capsys):
     assert run("evaluate", files / "shifted.json", "--truth", files / "truth.csv") == 0
-    assert capsys.readouterr().out.splitlines()[2].split() == ["bundle", "4", "/", "4", "10.0", "10.0", "10.0", "10.0"]
+    row = ["0", "dead", "reckoning", "bundle", "adjustment", "4", "/", "4", "10.0", "10.0", "10.0", "10.0"]
+    assert capsys.readouterr().out.splitlines()[1].split() == row
     assert run("evaluate", files / "shifted.json", "--truth", files / "truth.csv", "--json") == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["labels_total"], printed["labels_placed"]) == (4, 4)
     assert printed["error_mm"] == pytest.approx(dict.fromkeys(("mean", "median", "p95", "max"), 10.0))
+
+
+def test_evaluate_compares_maps_in_one_table(files, capsys):
+    maps = [files / "shifted.json"] * 2
+    assert run("evaluate", *maps, "--truth", files / "truth.csv") == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert run("evaluate", *maps, "--truth", files / "truth.csv", "--json") == 0
+    one, other = json.loads(capsys.readouterr().out)
+    assert one == other
+    assert 0 <= one["labels_within_95"] <= 4
 
 
 def test_evaluate_can_align_first(files, capsys):
@@ -183,7 +194,7 @@ def test_serve_hands_address_folder_and_token_to_the_server(tmp_path, monkeypatc
     (tmp_path / "token").write_text("secret\n")
     options = ["--host", "::1", "--port", "0", "--data", tmp_path / "data", "--token-file", tmp_path / "token"]
     assert run("serve", *options, "--recording-limit-gb", "2") == 0
-    assert calls == [("::1", 0, tmp_path / "data", "secret", {"recording_limit": 2_000_000_000})]
+    assert calls == [("::1", 0, tmp_path / "data", "secret", {"recording_limit": 2_000_000_000, "certificate": None})]
 
 
 @pytest.mark.parametrize("content", [b"", b"\n", b"two words\n", b"\xff\xfe"])

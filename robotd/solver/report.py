@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,9 +19,6 @@ from robotd.errors import InputError
 from robotd.geometry.transforms import wrap_angle
 from robotd.records import Floats, Map, MappedLabel, MappedStop, Survey, Vector3
 
-if TYPE_CHECKING:
-    from robotd.solver.evaluate import Evaluation
-
 CHI2_95 = {2: 5.991, 3: 7.815}  # 95 % quantiles of chi squared, by degrees of freedom
 GRID = 0.5  # m
 MANY = 120  # labels or stops: beyond it names would only cover one another
@@ -29,27 +26,6 @@ MANY = 120  # labels or stops: beyond it names would only cover one another
 INK, MUTED, FAINT, WALL = "#1c2127", "#6b7480", "#e3e6ea", "#c3c9d1"
 LINE = "#b9b1a3"
 ESTIMATE, TRUTH, ODOMETRY, ADJUSTED = "#f08a12", "#c2183a", "#4a7bd0", "#0a7d6c"
-
-ERRORS = (("mean", "mean"), ("median", "median"), ("p95", "95 %"), ("max", "max"))
-
-
-def text_table(evaluations: Mapping[str, Evaluation]) -> str:
-    """A table for the terminal: labels found and errors in millimetres, one row per method (as thesis table 3)."""
-    width = max([len("method"), *map(len, evaluations)])
-    lines = [
-        f"{'method':<{width}}   {'labels':>9}" + "".join(f" {title:>8}" for _, title in ERRORS),
-        f"{'':<{width}}   {'placed':>9}" + f" {'mm':>8}" * len(ERRORS),
-    ]
-    for name, evaluation in evaluations.items():
-        placed = f"{evaluation.labels_placed} / {evaluation.labels_total}"
-        errors = "".join(f" {_mm(evaluation.error_mm.get(key)):>8}" for key, _ in ERRORS)
-        lines.append(f"{name:<{width}}   {placed:>9}{errors}")
-    return "\n".join(lines)
-
-
-def _mm(value: float | None) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.1f}"
-
 
 # ---- what both views show --------------------------------------------------------------------------------------------
 
