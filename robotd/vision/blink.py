@@ -60,7 +60,6 @@ _LOOK_S = 1.0  # after which a camera that shakes looks again at what its pictur
 _TESTS_APART = 4  # apertures, and starts per flash, that are about one independent test
 FLOOR_PX = 0.01  # what fits keep in bias however strong the light: sampling, texture, the camera's curve
 _STEADY = 0.002  # relative change of the light below which lamps do not flicker
-_LONELY = 1.0  # typical limits that the alternation around a light is at least
 _CENSORED = 2.5  # a light that is partly clipped may be so much less certain in place
 _SEPARATION = 3  # cells; nearer lights are one light
 
@@ -378,9 +377,9 @@ class FlashDetector:
             ] = 0.0
         strength = np.maximum(total, clipped)
         # because in a camera that shakes whole edges alternate, and far more strongly than a label, which is small
-        around = (121.0 * cv2.blur(strength, (11, 11)) - 25.0 * cv2.blur(strength, (5, 5))) / 96.0
-        lonely = strength / (np.maximum(around, 0.0) + _LONELY * float(np.median(limit)))
-        turn = lonely / (1.0 + self._refused) ** 2
+        raised = np.maximum(strength, np.float32(1.0))
+        small = cv2.blur(raised, (3, 3)) / cv2.blur(raised, (11, 11))
+        turn = small / (1.0 + self._refused) ** 2
         clear = self._peaks(np.where(over > _CLEAR, turn, np.float32(0.0)), 2 * self.config.max_candidates // 3)
         # what is weaker, or found no room among the strong, has its turn before what was examined in vain
         over *= over > 1.0
