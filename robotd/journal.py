@@ -256,6 +256,7 @@ class Journal(JournalFile):
         """Note that a mission is over; raises StorageError if the disk does not take it."""
         with self.transaction():
             self.sure.execute("UPDATE missions SET ended = ? WHERE id = ?", (why, number))
+            self.sure.execute("DELETE FROM memories WHERE mission = ?", (number,))
 
     def unfinished(self) -> Unfinished | None:
         """The mission that was under way when the last daemon ended, if there was one."""
@@ -263,7 +264,8 @@ class Journal(JournalFile):
             row = self.sure.execute(
                 "SELECT name, leg, first_stop, is_attended, plan, missions.id, state, stop, along, missions.t, memory, "
                 "paused, boot FROM missions JOIN surveys ON surveys.id = missions.survey "
-                "LEFT JOIN clock ON clock.id = missions.clock WHERE ended IS NULL ORDER BY missions.id DESC LIMIT 1"
+                "LEFT JOIN clock ON clock.id = missions.clock "
+                "LEFT JOIN memories ON mission = missions.id WHERE ended IS NULL ORDER BY missions.id DESC LIMIT 1"
             ).fetchone()
         if row is None:
             return None
@@ -272,10 +274,11 @@ class Journal(JournalFile):
 
     def _update_mission(self, connection: sqlite3.Connection, note: MissionNote) -> None:
         connection.execute(
-            "UPDATE missions SET state = ?, stop = ?, along = ?, t = ?, clock = ?, paused = ?, "
-            "memory = coalesce(?, memory) WHERE id = ?",
-            (note.state, note.stop, note.along, note.t, self.clock, note.paused, note.memory, note.number),
+            "UPDATE missions SET state = ?, stop = ?, along = ?, t = ?, clock = ?, paused = ? WHERE id = ?",
+            (note.state, note.stop, note.along, note.t, self.clock, note.paused, note.number),
         )
+        if note.memory is not None:  # apart, because SQLite writes whole rows, and the other note comes every second
+            connection.execute("INSERT OR REPLACE INTO memories VALUES (?, ?)", (note.number, note.memory))
 
     # ---- upload queue ------------------------------------------------------------------------------------------------
 

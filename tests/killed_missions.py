@@ -140,11 +140,11 @@ class Lives:
                 break
         state = "starting"
         for _ in pauses(60.0) if stops else ():
-            state = self._look(is_hasty) or state
+            state = self.look(is_hasty=is_hasty) or state
             if len(TOLD.findall(robot.told())) >= stops:
                 break
         for _ in pauses(seconds):
-            state = self._look(is_hasty) or state
+            state = self.look(is_hasty=is_hasty) or state
             if state == "done":
                 break
         before = robot.state()
@@ -160,7 +160,7 @@ class Lives:
             self.missions += 1
             self._told = set()
 
-    def _look(self, is_hasty):
+    def look(self, *, is_hasty=True):
         """Begin a mission or go on with one; its state, None if nobody answers."""
         status = ask(self.robot.control, "mission.status")
         if status is None:

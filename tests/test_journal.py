@@ -363,7 +363,8 @@ def test_a_journal_of_a_version_before_is_taken_over_with_its_stops(tmp_path, ve
         journal.begin_leg(HEADER)
         journal.add_stop(HEADER.survey, make_stop(1))
     with sqlite3.connect(tmp_path / "j") as connection:
-        connection.execute("DROP TABLE missions")
+        for table in ("memories", "missions"):
+            connection.execute(f"DROP TABLE {table}")
         for column in ("flag", "replaces", "rejected", "original")[: 1 if version == 2 else 4]:
             connection.execute(f"ALTER TABLE stops DROP COLUMN {column}")
         connection.execute(f"PRAGMA user_version = {version}")

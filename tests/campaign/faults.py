@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -61,6 +62,28 @@ def test_a_daemon_may_be_killed_at_any_moment(tmp_path, seed):
         f"\nseed {seed}: {lives.kills} kills in {lives.missions} missions of {STOPS} stops, while {lives.states}; "
         f"rolled {1000 * lives.farthest:.0f} mm at most after a kill; connections {network.counts}"
     )
+
+
+def test_a_mission_writes_little_more_than_its_stops_and_its_trail(tmp_path):
+    with robot_of(tmp_path / "robot", "http://127.0.0.1:9").without_daemon() as robot:
+        lives = Lives(robot)
+        robot.begin()
+        while ask(robot.control, "mission.status") is None:
+            pass
+        before = written(robot.daemon.pid)
+        for _ in pauses(120.0):
+            if lives.look() == "uploading":
+                break
+        after = written(robot.daemon.pid)
+        robot.kill()
+    print(f"\n{(after - before) / 1e6:.2f} MB were written in a mission of {STOPS} stops")
+    assert after - before < 1.5e6
+
+
+def written(pid):
+    """Bytes that a process has had written to disks."""
+    fields = dict(line.split(": ") for line in Path(f"/proc/{pid}/io").read_text().splitlines())
+    return int(fields["write_bytes"])
 
 
 # ---- disks -----------------------------------------------------------------------------------------------------------
