@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from robotd.geometry.camera import Camera
 from robotd.records import CameraModel, Line, Pose, Transform
-from robotd.vision.line_icp import View, motion_between
+from robotd.vision.line_icp import LineOdometer, View, motion_between
 from robotd.vision.line_sight import to_robot
 from robotd.vision.line_tracker import LineTracker, PoseHistory, TrackerConfig
 from robotd.vision.polyline import arc_length
@@ -239,6 +239,28 @@ def test_the_error_of_the_stamps_is_learned_where_turns_begin_and_end(stamp_erro
     assert distance_to(near, path).max() < 0.008
 
 
+def test_what_a_frame_showed_from_the_robot_does_not_change_with_what_it_taught_about_the_stamps(monkeypatch):
+    """The memory moves by then, by 30 ms of turning at the first corner; the motion between two views must not."""
+    views, observe = [], LineOdometer.observe
+
+    def kept(self, view, *rest):
+        views.append(view.points)
+        return observe(self, view, *rest)
+
+    monkeypatch.setattr(LineOdometer, "observe", kept)
+    s = np.arange(0.0, 0.9, 0.003)
+    heading = np.cumsum(np.where(s > 0.3, 3.0, 0.0) * 0.003)
+    path = np.cumsum(0.003 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    history, tracker = PoseHistory(20.0), LineTracker(VIEW)
+    for k in range(len(s)):
+        history.add(0.015 * k, Pose(path[k, 0], path[k, 1], heading[k]))
+    for t in np.arange(0.1, 2.5, 1 / 30):
+        (line,) = seen(path, history.at(t)[0])
+        assert tracker.observe([line], t - 0.05, history, 0.2 * t)
+        assert distance_to(views[-1], VIEW.to_robot(line.points)).max() < 0.0055  # half their spacing
+    assert abs(tracker.stamp_error) > 0.01
+
+
 def test_neither_the_end_of_the_view_nor_steps_of_the_encoders_look_like_late_stamps():
     rng, history, path = np.random.default_rng(0), PoseHistory(9.0), line_along_x(length=8.0)
     for k in range(540):
@@ -450,6 +472,19 @@ def test_late_stamps_count_where_the_robot_changes_its_motion():
         )
         added = np.linalg.pinv(doubtful, hermitian=True) - np.linalg.pinv(alike, hermitian=True)
         assert math.sqrt(max(added[2, 2], 0.0)) == pytest.approx(sigma, abs=1e-4)
+
+
+def test_stamps_whose_error_is_still_being_learned_are_no_better_known_than_it_moves():
+    one, two = views(line_along_x(length=3.0), Pose(0, 0, 0), Pose(0.1, 0.0, 0.0))
+    turning = View(two.t, two.points, two.sigma, two.toward, 0.2, 0.6)
+
+    def information(moved, late):
+        odometer = LineOdometer(0.001, (0.0, 0.0), 0.0, 8.0)
+        assert odometer.observe(one, Pose(0, 0, 0), 0.01, late) is None
+        return odometer.observe(turning, Pose(0.1, 0.0, 0.0), 0.01 + moved, late).information
+
+    np.testing.assert_allclose(information(0.03, 0.0), information(0.0, 0.03))
+    assert np.trace(information(0.03, 0.0)) < 0.5 * np.trace(information(0.0, 0.0))
 
 
 def test_views_of_different_lines_tell_no_motion():

@@ -209,7 +209,7 @@ class LineOdometer:
         self._whole = whole
         self._jitter = jitter
         self._independent = independent
-        self._key: tuple[View, Pose] | None = None
+        self._key: tuple[View, Pose, float] | None = None
 
     def reset(self) -> None:
         """Begin anew."""
@@ -220,10 +220,10 @@ class LineOdometer:
 
         `stamp_error` is added to the views' stamps; `late` is its standard deviation, both in seconds.
         """
-        key, self._key = self._key, (view, pose)
+        key, self._key = self._key, (view, pose, stamp_error)
         if key is None or view.t - key[0].t > KEY_LONGEST:
             return None
-        (before, start) = key
+        before, start, error_then = key
         turn = math.remainder(pose.heading - start.heading, 2.0 * math.pi)
         x, y = to_robot(np.array([[pose.x, pose.y]]), start)[0].tolist()
         if math.hypot(x, y) < KEY_DISTANCE and abs(turn) < KEY_TURN:
@@ -236,7 +236,7 @@ class LineOdometer:
             point_sigma=self._point_sigma,
             whole=self._whole,
             jitter=self._jitter,
-            late=late,
+            late=math.hypot(late, stamp_error - error_then),  # an estimate that still moves is no better than it moves
             independent=self._independent,
         )
         if moved is None or not moved[1].any():

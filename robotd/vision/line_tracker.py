@@ -334,8 +334,8 @@ class LineTracker:
             if _covered(match) < 3 * config.spacing:
                 break
             if self._seen is None:
-                self._register(match, sight)
                 self._note(sight)
+                self._register(match, sight)
             fresh = line.match(sight, config.match)
             if fresh is not None:
                 self._merge(fresh, sight, grow=grows)
