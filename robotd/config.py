@@ -63,7 +63,8 @@ class MissionConfig:
     With `stop_at` "distances" the robot stops at `stops`, metres along the line; with "markers" where it starts, then
     at each square or dot beside the line, until the line ends or `marker_stops` stops are made. `camera_groups` are
     the rig's cameras that look at the same time, one group after the other; empty: all at once. `resume` says whether a
-    mission whose process ended goes on by itself where nothing speaks against it, or waits for an operator.
+    mission whose process ended goes on by itself where nothing speaks against it, or waits for an operator. A `plan`
+    of `robotd-solver plan` replaces `stops`, and names labels that are not asked at them.
     """
 
     survey: str = "store"
@@ -88,6 +89,7 @@ class MissionConfig:
     labels_from: Literal["config", "file", "server", "system"] = "config"
     labels_file: Path = Path("labels.txt")
     zones: tuple[Zone, ...] = ()
+    plan: Path | None = None
 
     def __post_init__(self) -> None:
         if any(later <= earlier for earlier, later in zip(self.stops, self.stops[1:], strict=False)):
@@ -98,6 +100,10 @@ class MissionConfig:
             low, enough = getattr(self, f"low_{name}"), getattr(self, f"enough_{name}")
             if enough < low:
                 raise ValueError(f"enough_{name} = {enough:g}; expected at least low_{name} = {low:g}")
+        if self.plan is not None and self.stop_at != "distances":
+            raise ValueError(
+                f"stop_at = '{self.stop_at}'; expected 'distances' with a plan, whose stops are along the line"
+            )
         if self.stop_at == "markers" and not self.marker_stops:
             raise ValueError("marker_stops = 0; expected with stop_at = 'markers' how many stops to make at most")
         counts = Counter(self.labels)

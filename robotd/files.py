@@ -24,6 +24,7 @@ import msgspec
 
 from .bind import bind
 from .errors import ConfigError, InputError
+from .plan_records import Plan
 from .records import Map, Stop, Survey, Vector3
 from .survey_checks import Problems, check_header, check_map, check_stop, check_stops
 from .typed_json import decode, repeated_keys
@@ -33,6 +34,7 @@ Points = dict[str, tuple[Vector3, float | None]]
 
 SURVEY_FORMATS = ("robotd-survey/1",)
 MAP_FORMATS = ("robotd-map/1",)
+PLAN_FORMATS = ("robotd-plan/1",)
 
 
 # ---- surveys and maps ------------------------------------------------------------------------------------------------
@@ -127,6 +129,32 @@ def check_survey(survey: Survey, where: str) -> None:
 def _check_survey_parts(parts: Mapping[str, Any], problems: Problems) -> None:
     check_header(parts, problems)
     check_stops(parts.get("stops"), parts.get("rig"), parts.get("roof_cameras"), problems)
+
+
+def load_plan(path: str | Path) -> Plan:
+    """Read a `robotd-plan/1` file; raises InputError listing every mistake."""
+    return _bound(Plan, _table(read_bytes(path), str(path), PLAN_FORMATS), str(path), _check_plan)
+
+
+def save_plan(plan: Plan, path: str | Path) -> None:
+    """Write a `robotd-plan/1` file, atomically."""
+    write_atomic(path, plan_to_json(plan))
+
+
+def plan_to_json(plan: Plan) -> bytes:
+    """The plan as a `robotd-plan/1` file: one label a line."""
+    return _to_json(plan, f"plan of {plan.survey}")
+
+
+def _check_plan(parts: Mapping[str, Any], problems: Problems) -> None:
+    """Stops along the line come one after the other, from where the robot stands."""
+    last = parts.get("begin", 0.0)
+    for index, stop in enumerate(parts.get("stops") or ()):
+        if stop is None or stop.along is None:
+            continue
+        if stop.along < last or (index and stop.along == last):
+            problems.add(f"stops[{index}].along", f"found {stop.along:g} after {last:g}; expected increasing metres")
+        last = max(last, stop.along)
 
 
 # ---- JSON ------------------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from .journal_records import MissionNote, Unfinished
 from .mission_steps import FAULT_WAIT_S, Health, Pause, Steps
 from .observation import Observer, Site
 from .odometry import Odometry
+from .plan_records import Plan
 from .plugin import Base, Camera, FollowEnd, Follower, Labels
 from .records import MissionState, Pose, Sighting, Stop, Survey
 
@@ -53,6 +54,8 @@ class Mission(Steps):
         The mission that this one goes on with. It begins paused.
     doubt : str, optional
         Why it must not go on by itself then.
+    advice : Plan, optional
+        Where the configured stops come from, and which labels are not worth asking there.
     """
 
     def __init__(
@@ -75,6 +78,7 @@ class Mission(Steps):
         is_attended: bool = False,
         interrupted: Unfinished | None = None,
         doubt: str | None = None,
+        advice: Plan | None = None,
     ) -> None:
         most = config.marker_stops if config.stop_at == "markers" else len(config.stops)
         super().__init__(bus, base, follower, health, number=first_stop, most=most, is_attended=is_attended)
@@ -97,11 +101,14 @@ class Mission(Steps):
             labels=labels,
             journal=journal,
             tell=lambda text: self._tell("observing", text),
+            advice=advice,
         )
         self._id = 0  # in the journal
         self._leg_stops = 0  # made in this leg
         self._standing_at = first_stop  # where the robot is at the start; 0: between two stops
         self._origin = config.stops[first_stop - 1] if self._by_distance else 0.0  # metres along the line, there
+        if advice is not None and first_stop == 1:
+            self._standing_at, self._origin = 0, advice.begin
         if interrupted is not None:
             self._go_on_from(interrupted, doubt)
 

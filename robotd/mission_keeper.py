@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, cast
 from .clock import in_thread, now, ticks
 from .config import MissionConfig
 from .errors import InputError, MissionError, StorageError, UploadError
-from .files import map_to_json, write_atomic
+from .files import load_plan, map_to_json, write_atomic
 from .hardware import flicker_free
 from .journal_records import MissionNote, Unfinished
 from .label_source import LabelSource
 from .mission import Mission, plan
 from .mission_guards import BatteryGuard, DiskGuard
 from .mission_steps import Health
+from .plan_records import Plan
 from .plugin import Base, Camera, Follower, Labels
 from .records import Event, Map, MappedLabel
 from .upload import Uploader
@@ -97,7 +98,7 @@ class MissionKeeper:
 
     async def _go_on(self, found: Unfinished) -> None:
         try:
-            if found.plan != plan(self.daemon.assembly.config.mission):
+            if found.plan != plan(await self._planned()):
                 raise InputError("its stops are others now ([mission] stops, stop_at)")
             how = {"is_attended": found.is_attended, "interrupted": found, "doubt": self._doubt(found)}
             await self._begin(found.survey, **how)
@@ -146,7 +147,7 @@ class MissionKeeper:
             See `LabelSource.labels`.
         """
         daemon, assembly = self.daemon, self.daemon.assembly
-        mission = assembly.config.mission
+        mission = await self._planned()
         if everywhere:
             mission = replace(mission, zones=())
         identify = replace(
@@ -161,6 +162,24 @@ class MissionKeeper:
         )
         labels = await source.labels(mission, survey, goes_on=goes_on)
         return replace(mission, identify=identify, survey=survey, labels=labels, labels_from="config")
+
+    async def _advice(self) -> Plan | None:
+        """The plan that the configuration names; raises InputError if it cannot be read or has no stops."""
+        assembly = self.daemon.assembly
+        if assembly.config.mission.plan is None:
+            return None
+        path = assembly.path.parent / assembly.config.mission.plan
+        found = await in_thread(load_plan, path)
+        if not found.distances():
+            raise InputError(
+                f"{path} stops: found none along the line; expected stops to make, or leave out [mission] plan"
+            )
+        return found
+
+    async def _planned(self) -> MissionConfig:
+        """The configuration with the stops of its plan, if it names one."""
+        mission, advice = self.daemon.assembly.config.mission, await self._advice()
+        return mission if advice is None else replace(mission, stops=advice.distances())
 
     # ---- one mission -------------------------------------------------------------------------------------------------
 
@@ -192,6 +211,7 @@ class MissionKeeper:
                 insist=self._insist,
             ),
             wake_upload=self._wake_upload,
+            advice=await self._advice(),
             **how,
         )
         await mission.begin()

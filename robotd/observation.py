@@ -20,6 +20,7 @@ from .errors import DriverFault, MissionError
 from .hardware import CameraMode
 from .identify import DelayModel, FlashRequest, Identifier, LabelMemory, Slot
 from .journal import Journal
+from .plan_records import Plan
 from .plugin import Camera, Labels
 from .records import Event, Frame, Pose, Sighting
 
@@ -47,6 +48,8 @@ class Observer:
         The rig's, by name.
     tell : callable
         Gets what it does, in words.
+    advice : Plan, optional
+        Names labels that are not worth asking at a stop.
 
     Attributes
     ----------
@@ -68,6 +71,7 @@ class Observer:
         labels: Labels,
         journal: Journal,
         tell: Callable[[str], None],
+        advice: Plan | None = None,
     ) -> None:
         self.config = config
         self.bus = bus
@@ -75,6 +79,7 @@ class Observer:
         self.labels = labels
         self.journal = journal
         self.tell = tell
+        self.advice = advice
         self.undecided = 0
         self.refused: dict[str, str] = {}
         zones = [(zone.labels, zone.begin, zone.end) for zone in config.zones]
@@ -120,6 +125,8 @@ class Observer:
     async def _look(self, group: Sequence[str], site: Site) -> tuple[Sighting, ...]:
         """What these cameras see in slots of their own."""
         mode = CameraMode(exposure=self.config.identify.exposure_s, mains_hz=self.config.mains_hz)
+        if self.advice is not None:
+            self.memory.learnt = set(self.advice.skipped(site.along) & self.memory.index.keys())
         identifier = await in_thread(
             Identifier,
             self.config.labels,

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from . import workbench_tool
 from .errors import InputError, RobotdError
 from .lens_commands import add_calibrate_camera
+from .plan_tool import add_plan
 from .rig_commands import add_calibrate_rig, add_calibrate_time
 from .roof_commands import add_calibrate_roof, add_roof
 
@@ -109,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_calibrate(commands)
     workbench_tool.add(commands)
     add_roof(commands)
+    add_plan(commands)
     return parser
 
 

@@ -33,6 +33,7 @@ LAYERS = {
         "vision",
         "solver",
         "survey_checks",
+        "plan_records",
     ],
     2: [
         *("clock", "link", "real", "config", "files", "bus", "hardware", "journal", "upload", "telemetry", "recording"),
@@ -67,6 +68,7 @@ LAYERS = {
         "workbench_commands",
         "demo_roof",
         "roof_tool",
+        "plan_tool",
         "roof_commands",
         "lens_tool",
         "rig_commands",

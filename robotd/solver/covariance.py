@@ -42,7 +42,7 @@ def covariance_reference(adjustment: Adjustment, state: State) -> Covariance:
     linear = adjustment.linearise(state, SQUARE)
     S, V_inverse, WV = adjustment.eliminate(adjustment.normal(linear, state, SQUARE))
     n, labels = adjustment.size, len(V_inverse)
-    frame = _inverse(S)
+    frame = inverse(S)
     points = np.empty((labels, 3, 3))
     coupled = np.empty((len(adjustment.sightings), 15, 3))
     # held-fixed entries get a zero row and column by way of one extra index
@@ -72,7 +72,7 @@ def covariance_reference(adjustment: Adjustment, state: State) -> Covariance:
     return Covariance(0.5 * (points + points.transpose(0, 2, 1)), stops, np.clip(leverage, 0.0, 2.0))
 
 
-def _inverse(S: Floats) -> Floats:
+def inverse(S: Floats) -> Floats:
     """Inverse of a symmetric matrix; what rounding has made singular or negative counts as barely known."""
     if len(S) == 0:
         return S

@@ -150,7 +150,7 @@ def map_png(
     _draw_unplaced(figure, [label for label in result.labels if label.status not in ("placed", "known")], lowest)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
-    _write(path, buffer.getvalue())
+    save_picture(path, buffer.getvalue())
 
 
 def _plain(text: str, length: int) -> str:
@@ -398,7 +398,7 @@ def map_html(
         data = data.replace(character, f"\\u{ord(character):04x}")
     head, tail = page.split("__DATA__")
     page = head.replace("__TITLE__", html.escape(result.survey)) + data + tail
-    _write(path, page.encode("utf-8", "replace"))
+    save_picture(path, page.encode("utf-8", "replace"))
 
 
 def _page_data(
@@ -467,7 +467,8 @@ def _axes(label: MappedLabel) -> list[list[float]] | None:
     return [[float(f"{value:.4g}") for value in column] for column in half.T]
 
 
-def _write(path: str | Path, data: bytes) -> None:
+def save_picture(path: str | Path, data: bytes) -> None:
+    """Write a picture or page; raises InputError if that fails."""
     try:
         Path(path).write_bytes(data)
     except OSError as error:
