@@ -34,7 +34,8 @@ class StreamClock:
         Ticks without a good frame: damaged or lost. Known after half a second: a lost frame shifts all that follow by
         a tick, a late one only itself, so that the least lateness of some 30 frames tells them apart.
     late : int
-        Frames that arrived more than 10 ms later than their bytes and the pace of the others explain.
+        Frames that arrived more than 10 ms later than their bytes, with those of damaged ones before them, and the pace
+        of the others explain.
     """
 
     def __init__(self, baud: int, frame_size: int) -> None:
@@ -42,6 +43,7 @@ class StreamClock:
         self._byte = 10.0 / baud
         self._size = frame_size
         self._last = 0.0
+        self._end: int | None = None  # of the last frame, in bytes fed
         self.restart()
 
     def stamps(self, arrived: float, ends: Sequence[int], fed: int, *, begun: bool = False) -> list[float]:
@@ -67,14 +69,18 @@ class StreamClock:
         measured = arrived - rest - self._size * self._byte
         if begun:
             measured = min(measured, arrived - rest - TICK)
+        befores = [ends[0] - self._size if self._end is None else self._end, *ends]
+        ticks = [max(1, round((end - before) / self._size)) for before, end in zip(befores, ends, strict=False)]
+        self._end = ends[-1]
         dates = [measured]
-        for end, before in zip(ends[:0:-1], ends[-2::-1], strict=True):
-            dates.append(dates[-1] - max(1, round((end - before) / self._size)) * TICK)
-        return [self._settle(date) for date in reversed(dates)]
+        for passed in ticks[:0:-1]:
+            dates.append(dates[-1] - passed * TICK)
+        return [self._settle(date, passed) for date, passed in zip(reversed(dates), ticks, strict=True)]
 
     def restart(self) -> None:
         """The stream was interrupted: its pace begins anew."""
         self._estimate: float | None = None
+        self._end = None
         self._due: float | None = None  # when the last frame should have come if none was lost
         self._least, self._counted = math.inf, 0  # lateness, frames of the present window
 
@@ -93,7 +99,8 @@ class StreamClock:
             self._due += lost * TICK + slow
             self._least, self._counted = math.inf, 0
 
-    def _settle(self, measured: float) -> float:
+    def _settle(self, measured: float, ticks: int) -> float:
+        """The date of a frame that was taken `ticks` after the last one, by the bytes between them."""
         self._count(measured)
         before = self._estimate
         if before is None:
@@ -101,7 +108,7 @@ class StreamClock:
         else:
             steps = round((measured - before) / TICK)
             self._estimate = min(measured, before + max(1, steps) * TICK * (1.0 + DRIFT))
-            if measured - before - TICK > LATE_S:
+            if measured - before - ticks * TICK > LATE_S:
                 self.late += 1
         self._last = max(self._last, self._estimate)
         return self._last
