@@ -6,10 +6,11 @@ mission begins with it when the source cannot be asked, and says so; an interrup
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-from .clock import in_thread
+from .clock import in_thread, now
 from .config import MissionConfig
 from .errors import DriverFault, InputError, MissionError, UploadError
 from .files import read_bytes, write_atomic
@@ -18,6 +19,7 @@ from .plugin import Labels, ListsLabels
 from .upload import Uploader
 
 KEPT = "labels.txt"
+OPEN_S = 10.0  # for the label system's driver to be opened, when robotd has just been started
 
 
 class LabelSource:
@@ -31,6 +33,8 @@ class LabelSource:
         Where the last list is kept.
     labels : Labels
         The label system's driver.
+    fault : callable
+        Why that driver does not work now, in words, or None.
     uploader : Uploader or None
         Of the server.
     warn : callable
@@ -38,11 +42,18 @@ class LabelSource:
     """
 
     def __init__(
-        self, folder: Path, state: Path, labels: Labels, uploader: Uploader | None, warn: Callable[[str], None]
+        self,
+        folder: Path,
+        state: Path,
+        labels: Labels,
+        fault: Callable[[], str | None],
+        uploader: Uploader | None,
+        warn: Callable[[str], None],
     ) -> None:
         self._folder = folder
         self._kept = state / KEPT
         self._labels = labels
+        self._fault = fault
         self._uploader = uploader
         self._warn = warn
 
@@ -94,6 +105,11 @@ class LabelSource:
             raise MissionError(
                 f"{self._labels.name}: this driver cannot list its labels; set [mission] labels_from to another source"
             )
+        deadline = now() + OPEN_S
+        while (fault := self._fault()) is not None:
+            if now() > deadline:
+                raise DriverFault(fault)
+            await asyncio.sleep(0.1)
         return (await self._labels.listed()).encode(), f"the labels from {self._labels.name}"
 
 

@@ -157,8 +157,10 @@ class MissionKeeper:
             exposure_s=flicker_free(mission.identify.exposure_s, mission.mains_hz),
         )
         source = LabelSource(
-            *(assembly.path.parent, daemon.state, cast(Labels, assembly.labels), daemon.uploader),
-            lambda text: self._say(text, "warning"),
+            *(assembly.path.parent, daemon.state, cast(Labels, assembly.labels)),
+            fault=lambda: next(item.fault for item in daemon.supervisors if item.driver is assembly.labels),
+            uploader=daemon.uploader,
+            warn=lambda text: self._say(text, "warning"),
         )
         labels = await source.labels(mission, survey, goes_on=goes_on)
         return replace(mission, identify=identify, survey=survey, labels=labels, labels_from="config")

@@ -55,6 +55,7 @@ class Shop:
 
     name = "labels"
     text = "A1\nA2\n"
+    fault = None
 
     async def listed(self):
         if self.text is None:
@@ -63,7 +64,8 @@ class Shop:
 
 
 def read(folder, labels=None, *, goes_on=False, warnings=None, **config):
-    source = LabelSource(folder, folder, labels, None, ([] if warnings is None else warnings).append)
+    warn = ([] if warnings is None else warnings).append
+    source = LabelSource(folder, folder, labels, lambda: getattr(labels, "fault", None), None, warn)
     return run_virtual(source.labels(MissionConfig(**config), "store", goes_on=goes_on))
 
 
@@ -94,6 +96,10 @@ def test_a_source_that_cannot_be_asked_is_replaced_by_what_it_said_last(tmp_path
     assert read(tmp_path, shop, labels_from="system", warnings=warnings) == ("A1", "A2")
     assert warnings == ["the list of labels is the last one: labels: unplugged"]
     shop.text = "A3\n"
+    shop.fault = "labels: not opened yet"
+    assert read(tmp_path, shop, labels_from="system", warnings=warnings) == ("A1", "A2")
+    assert warnings[1:] == ["the list of labels is the last one: labels: not opened yet"]
+    shop.fault = None
     assert read(tmp_path, shop, labels_from="system", goes_on=True) == ("A1", "A2")
     assert read(tmp_path, shop, labels_from="system") == ("A3",)
 

@@ -51,13 +51,13 @@ def test_no_change_is_made_that_the_table_does_not_have(wanted):
 # ---- across a restart ------------------------------------------------------------------------------------------------
 
 
-def lives(folder, *scenarios, boots=("boot",) * 9, away=5.0, **how):
+def lives(folder, *scenarios, boots=("boot",) * 9, away=5.0, stops=(0.0, 0.4, 0.8), **how):
     """One daemon after the other on the same folder, each until its scenario ends, in virtual time that goes on."""
 
     async def main():
         robots = []
         for boot, scenario in zip(boots, scenarios, strict=False):
-            robot = Operated(folder, **how)
+            robot = Operated(folder, stops, **how)
             robot.course.boot_id = lambda boot=boot: boot
             robots.append(robot)
             running = asyncio.create_task(robot.daemon.run(mission=False, control=robot.socket))
@@ -100,7 +100,6 @@ def stops_in(folder):
     [
         ("observing", 1, 0.1, [(1, 1), (1, 2), (1, 3)]),  # a leg without a stop gives its number to the next one
         ("driving", 2, 2.0, [(1, 1), (2, 2), (2, 3)]),
-        ("settling", 2, 0.1, [(1, 1), (2, 2), (2, 3)]),
         ("observing", 3, 0.3, [(1, 1), (1, 2), (2, 3)]),
     ],
 )
@@ -114,10 +113,10 @@ def test_a_mission_goes_on_by_itself_where_it_was(tmp_path, state, stop, seconds
 
 
 def test_a_mission_that_was_on_its_way_drives_the_rest_of_it(tmp_path):
-    first, second = lives(tmp_path, until("driving", 2, 3.0), to_the_end, resume="auto")
+    first, second = lives(tmp_path, until("driving", 2, 3.0), to_the_end, resume="auto", stops=(0.0, 1.0))
     assert first.course.travelled == pytest.approx(0.55, abs=0.1)
     # what it rolled in the last second before the end was not noted yet
-    assert 2.0 - 0.05 <= first.course.travelled + second.course.travelled <= 2.0 + 0.35
+    assert 1.0 - 0.05 <= first.course.travelled + second.course.travelled <= 1.0 + 0.35
 
 
 def test_by_default_an_operator_is_asked(tmp_path):
@@ -204,7 +203,7 @@ def test_a_mission_whose_stops_have_changed_is_not_resumed_and_says_so(tmp_path)
     assert stops_in(tmp_path) == [(1, 1)]
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(1))
 def test_whenever_it_is_interrupted_every_stop_is_made_once(tmp_path, seed):
     times = np.random.default_rng(seed).uniform(0.1, 9.0, 5)
 
@@ -269,42 +268,27 @@ def test_what_was_learnt_of_labels_and_their_system_is_taken_over_but_no_places(
     assert LabelMemory(("a",), (), config.identify).state()["asked"] == {}
 
 
-def test_places_are_forgotten_before_a_lifted_robot_looks_again(tmp_path):
+@pytest.mark.parametrize("state", ["driving", "observing"])
+def test_a_lifted_robot_begins_a_new_leg_and_forgets_places_before_it_looks(tmp_path, state):
     async def scenario(robot, client):
         await client.call("mission.start")
-        await robot.until("driving", 2)
-        await asyncio.sleep(1.0)
+        await robot.until(state, 2)
         robot.order = []
-        memory, observe = robot.daemon.mission.observer.memory, robot.daemon.mission.observer.observe
-        forget = memory.forget_places
-        memory.forget_places = lambda: (robot.order.append("forget"), forget())
-        robot.daemon.mission.observer.observe = lambda *given: (robot.order.append("look"), observe(*given))[1]
-        robot.course.body.wheel_drop_left = True
-        await robot.until("paused")
-        robot.course.body.wheel_drop_left = False
-        await asyncio.sleep(1.0)
-        await client.call("mission.resume")
-        await robot.until("done")
-
-    (robot,) = lives(tmp_path, scenario)
-    assert robot.order == ["forget", "look", "look"]
-    assert stops_in(tmp_path) == [(1, 1), (2, 2), (2, 3)]
-
-
-def test_a_stop_at_which_the_robot_is_lifted_is_made_again(tmp_path):
-    async def scenario(robot, client):
-        await client.call("mission.start")
-        await robot.until("observing", 2)
+        observer = robot.daemon.mission.observer
+        forget, observe = observer.memory.forget_places, observer.observe
+        observer.memory.forget_places = lambda: (robot.order.append("forget"), forget())
+        observer.observe = lambda *given: (robot.order.append("look"), observe(*given))[1]
         robot.course.body.wheel_drop_left = True
         await robot.until("paused")
         assert "wheel has dropped" in (await client.call("mission.status"))["text"]
         robot.course.body.wheel_drop_left = False
-        await asyncio.sleep(1.0)
+        await asyncio.sleep(0.5)
         await client.call("mission.resume")
         await robot.until("done")
 
-    lives(tmp_path, scenario)
-    assert stops_in(tmp_path) == [(1, 1), (2, 2), (2, 3)]
+    (robot,) = lives(tmp_path, scenario, stops=(0.0, 0.4))
+    assert robot.order == ["forget", "look"]
+    assert stops_in(tmp_path) == [(1, 1), (2, 2)]
 
 
 # ---- dates -----------------------------------------------------------------------------------------------------------
@@ -316,7 +300,7 @@ def test_a_date_that_steps_is_noted_and_costs_no_stop(tmp_path):
         robot.course.utc = lambda: start + timedelta(seconds=now()) + jump
         await client.call("mission.start")
         for step in (timedelta(days=200), -timedelta(days=4000), timedelta(hours=-1)):
-            await asyncio.sleep(4.0)
+            await asyncio.sleep(3.0)
             jump += step
         await robot.until("done")
         await asyncio.sleep(6.0)
@@ -324,4 +308,4 @@ def test_a_date_that_steps_is_noted_and_costs_no_stop(tmp_path):
 
     (robot,) = lives(tmp_path, scenario)
     assert stops_in(tmp_path) == [(1, 1), (1, 2), (1, 3)]
-    assert robot.clocks >= 3
+    assert robot.clocks >= 2  # it is looked at every 10 s
