@@ -117,6 +117,26 @@ def accumulate(
             _alternation_row(&difference[i, 0], &lagged_difference[i, 0], &total[i, 0], columns)
 
 
+def add_block(
+    const int16_t[:, ::1] block, int low, int high, float[:, ::1] total, float[:, ::1] clipped
+):
+    cdef Py_ssize_t rows = block.shape[0], columns = block.shape[1], i, j
+    cdef int16_t value, least = <int16_t>low, most = <int16_t>high
+    cdef const int16_t* values
+    cdef float* sums
+    cdef float* limited
+    with nogil:
+        for i in range(rows):
+            values = &block[i, 0]
+            sums = &total[i, 0]
+            limited = &clipped[i, 0]
+            for j in range(columns):
+                value = values[j]
+                sums[j] += value
+                value = most if value > most else value
+                limited[j] += least if value < least else value
+
+
 def shift_moments(
     const uint16_t[:, ::1] cells,
     const int16_t[:, ::1] reference,

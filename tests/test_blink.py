@@ -1,3 +1,4 @@
+import tracemalloc
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,7 +122,9 @@ def test_the_accumulation_kernel_equals_its_numpy_reference(rows, columns, seed)
             module.accumulate(cells, lagged, down, right, *move, difference, before, total, 3)
             moments = np.empty((2, 2, 3), np.float32)
             module.shift_moments(cells, down, right, down, 3, 2, moments)
-            results.append((cells, difference, total, moments))
+            sums, limited = np.zeros((2, rows, columns), np.float32)
+            module.add_block(down, -200, 300, sums, limited)
+            results.append((cells, difference, total, moments, sums, limited))
         for left, other in zip(*results, strict=True):
             np.testing.assert_allclose(left, other, rtol=1e-5, atol=4.0)
 
@@ -344,6 +347,20 @@ def test_a_light_that_clips_the_sensor_says_so_and_keeps_its_place():
     assert found[0][0].saturated
     assert not found[1][0].saturated
     assert np.hypot(found[0][0].u - 60.4, found[0][0].v - 50.3) < 0.3
+
+
+def test_a_detector_keeps_within_twenty_megabytes():
+    rng = np.random.default_rng(0)
+    frames = rng.integers(60, 120, (4, 480, 640), dtype=np.uint8)
+    FlashDetector().detect(frames[rng.integers(4, size=60)], np.arange(60) / 30.0)  # loads what is loaded once
+    order = rng.integers(4, size=110)
+    tracemalloc.start()
+    try:
+        FlashDetector().detect((frames[k] for k in order), np.arange(110) / 30.0)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak <= 20e6
 
 
 def test_a_still_noisy_wall_has_no_flashes():

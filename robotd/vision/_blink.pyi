@@ -14,6 +14,9 @@ def accumulate(
     total: NDArray[np.int16],
     before: int,
 ) -> None: ...
+def add_block(
+    block: NDArray[np.int16], low: int, high: int, total: NDArray[np.float32], clipped: NDArray[np.float32]
+) -> None: ...
 def shift_moments(
     cells: NDArray[np.uint16],
     reference: NDArray[np.int16],

@@ -48,7 +48,7 @@ Indices = NDArray[np.intp]
 _RING = 96  # frames kept; at 328x248 cells of 2 bytes 15.6 MB
 _FEW = 4  # frames since the last decision that are not worth another one
 _BLOCK = 32  # frames whose alternation fits into 16 bits: 32 * 63 * 63 / 4 < 2^15
-_LOW, _HIGH = 4.0, 1500.0  # a block's alternation counts no further than so many typical ones below, and this above
+_LOW, _HIGH = 4.0, 1500  # a block's alternation counts no further than so many typical ones below, and this above
 _CLEAR = 1.8  # limits from which a place is clear enough to be examined at every decision
 _NO_SPOT = 12.0  # refusals that a place counts which follows the pattern but is no small light: it costs most
 _FORGET = 0.8  # of a place's refusals, from one decision to the next
@@ -115,7 +115,7 @@ class FlashDetector:
         self._lamps = np.zeros((_RING, BANDS))  # relative change of each band's light
         self._shift_sum = np.zeros(2)  # places are given where they are in the mean picture
         self._shake = Shake(BEFORE)
-        self._blocks: deque[tuple[int, NDArray[np.int16], np.int16]] = deque()  # frames, sums, lower limit
+        self._blocks: deque[tuple[int, NDArray[np.int16], int]] = deque()  # frames, sums, lower limit
         self._count = 0
         self._block_frames = 0
         self._due = self._looked = -np.inf
@@ -254,8 +254,6 @@ class FlashDetector:
         depth = int(np.ceil(1.7 * self._lag * _RING / self.config.window_s)) + 2
         self._differences = np.zeros((depth, *shape), np.int8)
         self._total = np.zeros(shape, np.int16)
-        self._window = np.zeros(shape, np.int32)  # sum of the blocks
-        self._clipped = np.zeros(shape, np.int32)  # the same, each limited
         self._refused = np.zeros(shape, np.float32)  # how often a place was examined in vain, of late
         self._due = t + self.config.decision_s
 
@@ -311,16 +309,12 @@ class FlashDetector:
     def _decide(self, t: float) -> None:
         # because who passes by weighs more in one block than a label in all others
         usual = float(np.median(np.abs(self._total[1::4, 1::4]))) + 1.0
-        low = np.int16(-min(_LOW * usual, _HIGH))
+        low = -int(min(_LOW * usual, _HIGH))
         self._blocks.append((self._block_frames, self._total, low))
-        self._window += self._total
-        self._clipped += np.clip(self._total, low, np.int16(_HIGH))
         self._total = np.zeros_like(self._total)
         self._block_frames = 0
         while sum(block[0] for block in self._blocks) * self._pace() > self._window_s() + self.config.decision_s:
-            _, gone, low = self._blocks.popleft()
-            self._window -= gone
-            self._clipped -= np.clip(gone, low, np.int16(_HIGH))
+            self._blocks.popleft()
         if t - self._times[0][1] < 1.4 * self.config.pattern.period:
             return
         rows, columns = self._candidates()
@@ -366,27 +360,32 @@ class FlashDetector:
 
     def _candidates(self) -> tuple[Indices, Indices]:
         """Apertures whose alternation stands out, strongest first."""
-        total, clipped = self._window.astype(np.float32), self._clipped.astype(np.float32)
-        limit = self._limit(total)
-        over = np.maximum(total / limit, clipped / self._limit(clipped))
+        total, clipped = self._alternation()
+        strength = np.maximum(total, clipped)
+        self._divide(total)
+        self._divide(clipped)
+        over = np.maximum(total, clipped, out=total)
+        del clipped
         over[-1] = over[:, -1] = 0.0
         for track in self.tracks:
             over[
                 max(track.row - _SEPARATION, 0) : track.row + _SEPARATION + 1,
                 max(track.column - _SEPARATION, 0) : track.column + _SEPARATION + 1,
             ] = 0.0
-        strength = np.maximum(total, clipped)
         # because in a camera that shakes whole edges alternate, and far more strongly than a label, which is small
-        raised = np.maximum(strength, np.float32(1.0))
-        small = cv2.blur(raised, (3, 3)) / cv2.blur(raised, (11, 11))
-        turn = small / (1.0 + self._refused) ** 2
-        clear = self._peaks(np.where(over > _CLEAR, turn, np.float32(0.0)), 2 * self.config.max_candidates // 3)
+        np.maximum(strength, 1.0, out=strength)
+        turn: Singles = np.asarray(cv2.blur(strength, (3, 3)), np.float32)
+        turn /= cv2.blur(strength, (11, 11))
+        del strength
+        turn /= (1.0 + self._refused) ** 2
+        turn[over <= _CLEAR] = 0.0
+        clear = self._peaks(turn, 2 * self.config.max_candidates // 3)
         # what is weaker, or found no room among the strong, has its turn before what was examined in vain
         over *= over > 1.0
         over /= 1.0 + self._refused
         over.ravel()[clear] = 0.0
         peaks = np.concatenate([clear, self._peaks(over, self.config.max_candidates // 3)])
-        rows, columns = np.divmod(peaks, total.shape[1])
+        rows, columns = np.divmod(peaks, over.shape[1])
         return np.ascontiguousarray(rows), np.ascontiguousarray(columns)
 
     @staticmethod
@@ -395,8 +394,15 @@ class FlashDetector:
         peaks = np.flatnonzero((image > 0.0) & (image >= cv2.dilate(image, np.ones((3, 3), np.uint8))))
         return peaks[np.argsort(-image.ravel()[peaks], kind="stable")][:most]
 
-    def _limit(self, total: Singles) -> Singles:
-        """What the alternation of every aperture must pass: its tile's median and so many spreads more."""
+    def _alternation(self) -> tuple[Singles, Singles]:
+        """Sum of the blocks, and the same with each limited: what has alternated of late, of every aperture."""
+        total, clipped = np.zeros(self._total.shape, np.float32), np.zeros(self._total.shape, np.float32)
+        for _, block, low in self._blocks:
+            kernels.add_block(block, low, _HIGH, total, clipped)
+        return total, clipped
+
+    def _divide(self, total: Singles) -> None:
+        """Divide the alternation of every aperture by what it must pass: its tile's median and so many spreads more."""
         height, width = total.shape
         frames = sum(block[0] for block in self._blocks)
         tiles = max(1, height // _TILE[0]), max(1, width // _TILE[1])
@@ -407,10 +413,11 @@ class FlashDetector:
         middle = np.partition(sample, half, axis=2)[:, :, half]
         deviation = np.partition(np.abs(sample - middle[:, :, None]), half, axis=2)[:, :, half]
         spread = 1.48 * deviation + 2.0 * np.sqrt(frames)
-        of_row = np.minimum(np.arange(height) // size[0], tiles[0] - 1)
-        of_column = np.minimum(np.arange(width) // size[1], tiles[1] - 1)
         limit = (middle + self.config.min_alternation * spread).astype(np.float32)
-        return np.asarray(limit[of_row[:, None], of_column])
+        of_column = np.minimum(np.arange(width) // size[1], tiles[1] - 1)
+        for k, row in enumerate(limit):
+            last = height if k == tiles[0] - 1 else (k + 1) * size[0]
+            total[k * size[0] : last] /= row[of_column]
 
     # ---- tracks ------------------------------------------------------------------------------------------------------
 

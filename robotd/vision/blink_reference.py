@@ -58,6 +58,14 @@ def accumulate(
     total[:-1, :-1] -= product >> 2
 
 
+def add_block(
+    block: NDArray[np.int16], low: int, high: int, total: NDArray[np.float32], clipped: NDArray[np.float32]
+) -> None:
+    """Add `block` (h, w) to `total`, and limited to [low, high] to `clipped`."""
+    total += block
+    clipped += np.clip(block, low, high)
+
+
 def shift_moments(
     cells: NDArray[np.uint16],
     reference: NDArray[np.int16],

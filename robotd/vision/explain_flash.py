@@ -73,7 +73,7 @@ def explain_blink(detector: FlashDetector, shape: tuple[int, int]) -> FlashExpla
     unit = "alternation in the pattern's rhythm"
     if detector._ring is None or not detector._blocks:
         return FlashExplanation(np.zeros(shape, np.float32), unit, (), (), threshold)
-    energy = np.maximum(detector._window + detector._total, 0).astype(np.float32)
+    energy = np.maximum(detector._alternation()[0] + detector._total, 0.0)
     change = cv2.resize(np.sqrt(energy), shape[::-1], interpolation=cv2.INTER_NEAREST)
     clusters = [_track(detector, track) for track in detector.tracks]
     triggers = []

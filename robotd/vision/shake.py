@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +11,7 @@ except ImportError:  # built with ROBOTD_NO_EXTENSIONS=1
     from . import blink_reference as kernels  # type: ignore[no-redef]
 
 Floats = NDArray[np.float64]
+Shorts = NDArray[np.int16]
 
 BANDS = 6  # of rows, because a rolling shutter sees lamps flicker in waves
 _TILES = (BANDS, 8)
@@ -48,7 +47,7 @@ class Shake:
         self.offset = np.asarray(offset, float).copy()
         pixels = _padded(image)
         height, width = image.shape[0] // 2, image.shape[1] // 2
-        self._reference = np.ascontiguousarray(_fours(_fours(pixels[1:, 1:]).T).T[:height, :width], np.int16)
+        self._reference = np.ascontiguousarray(_fours(_fours(pixels[1:, 1:]).T).T[:height, :width])
         self._down, self._right = self.down, self.right = _gradients(pixels)
         tiles_down, tiles_right = self._tiled(self._down), self._tiled(self._right)
         self._mean = np.stack([tiles_right.mean(axis=1), tiles_down.mean(axis=1)])
@@ -108,31 +107,34 @@ class Shake:
         return shift
 
 
-def _padded(image: NDArray[np.uint8]) -> NDArray[np.int32]:
+def _padded(image: NDArray[np.uint8]) -> Shorts:
     height, width = image.shape[0] // 2, image.shape[1] // 2
-    return np.pad(image[: 2 * height, : 2 * width], ((1, 4), (1, 4)), "edge").astype(np.int32)
+    return np.pad(image[: 2 * height, : 2 * width], ((1, 4), (1, 4)), "edge").astype(np.int16)
 
 
-def _gradients(pixels: NDArray[np.int32]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+def _gradients(pixels: Shorts) -> tuple[Shorts, Shorts]:
     """Change of each aperture per px that a picture moves up, and left."""
     height, width = (pixels.shape[0] - 5) // 2, (pixels.shape[1] - 5) // 2
-    down = np.ascontiguousarray(_fours(_edges(pixels)[:, 1:].T).T[:height, :width], np.int16)
-    return down, np.ascontiguousarray(_fours(_edges(pixels.T)[:, 1:].T)[:height, :width], np.int16)
+    down = _fours(_edges(pixels)[:, 1:].T).T[:height, :width] // 2
+    right = _fours(_edges(pixels.T)[:, 1:].T)[:height, :width] // 2
+    return np.ascontiguousarray(down), np.ascontiguousarray(right)
 
 
-def _fours(pixels: NDArray[Any]) -> NDArray[Any]:
+def _pairs(pixels: Shorts) -> Shorts:
+    """Sums of rows 0 and 1, 2 and 3, and so on."""
+    return np.asarray(pixels[: len(pixels) // 2 * 2 : 2] + pixels[1::2])
+
+
+def _fours(pixels: Shorts) -> Shorts:
     """Sums of rows 0..3, 2..5, and so on."""
-    pairs = pixels[: len(pixels) // 2 * 2].reshape(-1, 2, pixels.shape[1]).sum(axis=1)
+    pairs = _pairs(pixels)
     return np.asarray(pairs[:-1] + pairs[1:])
 
 
-def _edges(pixels: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Derivative along the rows of the sums of rows 1..4, 3..6, and so on: what enters less what leaves.
+def _edges(pixels: Shorts) -> Shorts:
+    """Twice the derivative along the rows of the sums of rows 1..4, 3..6, and so on: what enters less what leaves.
 
     Differences of neighbouring sums would be far too small on fine texture.
     """
-    between = 0.5 * (pixels[:-1] + pixels[1:])  # row k is the edge between rows k and k + 1
-    count = (len(between) - 3) // 2
-    return np.asarray(
-        between[4 : 4 + 2 * count : 2][:count] - between[0 : 2 * count : 2][: len(between[4 : 4 + 2 * count : 2])]
-    )
+    pairs = _pairs(pixels)
+    return np.asarray(pairs[2:] - pairs[:-2])
