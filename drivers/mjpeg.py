@@ -24,11 +24,11 @@ from robotd.hardware import CameraCounts, CameraMode
 from robotd.jpeg import Channel
 from robotd.multipart import MultipartParser, Part, Skipped, boundary_of
 from robotd.records import Frame
+from robotd.secret_file import driver_secret
 
 CONNECT_S = 10.0  # for the connection and the answer to the request
 FIRST_RETRY_S, LAST_RETRY_S = 0.2, 5.0
 READ_BUFFER = 256 << 10
-PASSWORD_LIMIT = 4096  # bytes of a password file
 NO_PICTURE = 50  # parts in a row that are no image: something else is sent
 
 
@@ -36,7 +36,8 @@ NO_PICTURE = 50  # parts in a row that are no image: something else is sent
 class MjpegConfig:
     """[drivers.<camera>] with driver = "mjpeg"
 
-    The password is the first line of `password_file`. A camera that falls silent for `stall_s` is connected to again,
+    The password is the first line of `password_file`, which no other user may read, or the credential of the unit that
+    `password_credential` names. A camera that falls silent for `stall_s` is connected to again,
     and is at fault when nothing comes for `patience_s`. `channel` is what detectors get: "red" for the LEDs that roof
     cameras look for. `delay_s` is the time from the exposure to the arrival, of the quickest frames. `fps` is what the
     camera is set to, so that missing frames are told.
@@ -45,6 +46,7 @@ class MjpegConfig:
     url: str
     user: str | None = None
     password_file: Path | None = None
+    password_credential: str | None = None
     ca_file: Path | None = None
     channel: Channel = "gray"
     fps: float | None = ranged(None, minimum=0.1, maximum=1000.0)
@@ -64,8 +66,11 @@ class MjpegConfig:
             raise ValueError("url: holds a user or a password, which would be shown; use the keys user, password_file")
         if parts.scheme not in ("http", "https") or not host:
             raise ValueError(f"url: found '{parts.scheme}://{parts.netloc}{parts.path}'; {wanted}")
-        if (self.user is None) != (self.password_file is None):
-            raise ValueError("user and password_file belong together; expected both or neither")
+        secrets = [self.password_file, self.password_credential]
+        if len(secrets) - secrets.count(None) != (self.user is not None):
+            raise ValueError(
+                "user and password_file (or password_credential) belong together; expected both or neither"
+            )
         if self.ca_file is not None and parts.scheme != "https":
             raise ValueError("ca_file: there is nothing to verify with http; expected https in url")
 
@@ -92,7 +97,8 @@ class MjpegDriver(CameraDriver):
 
     async def open(self) -> None:
         """Connect once, and see that the camera streams; raises DriverFault."""
-        self._password = self._read_password()
+        config = self.config
+        self._password = driver_secret(config.password_file, config.password_credential, f"{self.name} password_file")
         self._login = {}
         session = aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(ssl=self._tls(), force_close=True),
@@ -259,20 +265,6 @@ class MjpegDriver(CameraDriver):
             self._publish(Frame(self.name, t, image, sequence, data), mode)
 
     # ---- secrets ----------------------------------------------------------------------------------------------------
-
-    def _read_password(self) -> str | None:
-        path = self.config.password_file
-        if path is None:
-            return None
-        try:
-            with path.open(encoding="utf-8") as file:
-                password = file.read(PASSWORD_LIMIT).split("\n", 1)[0].rstrip("\r")
-        except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
-            raise DriverFault(f"password_file {path} cannot be read: {why}") from None
-        if not password:
-            raise DriverFault(f"password_file {path} is empty; expected the password in its first line")
-        return password
 
     def _tls(self) -> ssl.SSLContext | bool:
         if not self.config.url.startswith("https:"):

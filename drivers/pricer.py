@@ -15,6 +15,7 @@ from ..bind import ranged
 from ..clock import outside
 from ..errors import DriverFault
 from ..plugin import Driver
+from ..secret_file import driver_secret
 
 AT_ONCE = 500  # labels in one request, the gateway's limit
 
@@ -26,11 +27,14 @@ class PricerConfig:
     host: str = "127.0.0.1"
     port: int = ranged(minimum=1, maximum=65535)
     token_file: Path | None = None
+    token_credential: str | None = None
     timeout_s: float = ranged(5.0, minimum=0.1, maximum=60.0)
 
     def __post_init__(self) -> None:
         if not self.host:
             raise ValueError("host = ''; expected the name or address of the label system's server")
+        if None not in (self.token_file, self.token_credential):
+            raise ValueError("found token_file and token_credential; expected one of them")
 
 
 class PricerDriver(Driver):
@@ -46,7 +50,8 @@ class PricerDriver(Driver):
 
     async def open(self) -> None:
         """Connect, and check that the gateway takes our token and requests; raises DriverFault."""
-        self._token = self._read_token()
+        config = self.config
+        self._token = driver_secret(config.token_file, config.token_credential, f"{self.name} token_file")
         self._number = 0
         self._turn = asyncio.Lock()
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
@@ -107,15 +112,6 @@ class PricerDriver(Driver):
             if following is None:
                 return "".join(pieces)
             start = following
-
-    def _read_token(self) -> str | None:
-        path = self.config.token_file
-        if path is None:
-            return None
-        try:
-            return path.read_text().strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise DriverFault(f"{self.name}: token_file {path} cannot be read: {error}") from error
 
     async def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         async with self._turn:

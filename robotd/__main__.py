@@ -297,15 +297,19 @@ def run(path: Path, *, mission: bool) -> int:
     """Run the daemon until SIGTERM or SIGINT, or until its mission has ended."""
     from .control_socket import ControlSocket
     from .daemon import Daemon, assemble
+    from .notify import notify
     from .operations import Operations
     from .prompt import converse
     from .real import RealHardware
+    from .service import keep_memory_together, keep_pauses_short, log_handler
 
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    keep_memory_together()
+    logging.basicConfig(level=logging.INFO, handlers=[log_handler()])
     hardware = RealHardware()
     assembly = assemble(path, hardware)
     hardware.guardian = path.parent / assembly.config.robot.guardian
     daemon = Daemon(assembly)
+    keep_pauses_short()
 
     async def until_told() -> None:
         control = ControlSocket(path.parent / assembly.config.robot.control, Operations(daemon))
@@ -313,8 +317,13 @@ def run(path: Path, *, mission: bool) -> int:
         talk = None
         if sys.stdin is not None and sys.stdin.isatty():
             talk = asyncio.ensure_future(converse(assembly.bus, sys.stdin.fileno(), print))
+
+        def stop() -> None:
+            notify("STOPPING=1\nSTATUS=stopping")
+            work.cancel()
+
         for number in (signal.SIGTERM, signal.SIGINT):
-            asyncio.get_running_loop().add_signal_handler(number, work.cancel)
+            asyncio.get_running_loop().add_signal_handler(number, stop)
         await asyncio.gather(work, return_exceptions=True)
         if talk is not None:
             talk.cancel()

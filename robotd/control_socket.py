@@ -154,6 +154,7 @@ class ControlSocket:
         self.path = path
         self._commands = commands
         self._clients: set[asyncio.Task[None]] = set()
+        self.settled = asyncio.Event()  # it listens, or never will
 
     async def run(self) -> None:
         """Until cancelled.
@@ -163,7 +164,10 @@ class ControlSocket:
         InputError
             The socket cannot be made, or another robotd listens there.
         """
-        listener = _listen(self.path)
+        try:
+            listener = _listen(self.path)
+        finally:
+            self.settled.set()
         failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
         async def admit(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

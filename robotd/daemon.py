@@ -36,6 +36,7 @@ from .records import Event, Map
 from .safety import SafetyGate
 from .secret_file import read_credential, read_secret
 from .serial_log import LoggedHardware, SerialLog
+from .service import describe, tell_manager
 from .supervisor import Supervisor
 from .upload import Uploader
 from .web import WebServer
@@ -298,9 +299,12 @@ class Daemon:
                     work.append(assembly.serial_log.follow(assembly.bus))
                 if control is not None:
                     work.append(self._listen(control))
+                work.append(tell_manager(self._line))
                 tasks = [self._group.create_task(item) for item in work]
                 self._upload_by(uploader)
-                notify("READY=1\nSTATUS=ready")
+                if control is not None:
+                    await control.settled.wait()
+                notify(f"READY=1\nSTATUS={self._line()}")
                 await self.missions.restore()
                 if mission:
                     await self.missions.run()
@@ -414,8 +418,32 @@ class Daemon:
     async def _log_events(self, journal: Journal) -> None:
         with self.assembly.bus.events.subscribe(size=256) as events:
             async for event in events:
-                log.log(LEVELS[event.level], "%s: %s", event.source, event.text)
+                fields = self._fields(event.source)
+                log.log(LEVELS[event.level], "%s: %s", event.source, event.text, extra={"fields": fields})
                 await in_thread(journal.add_event, event)
+
+    def _line(self) -> str:
+        """What `systemctl status` shows."""
+        gate = self.control.gate
+        faults = [f"{item.driver.name}: {item.fault}" for item in self.supervisors if item.fault is not None]
+        return describe(
+            self.assembly.bus.status.latest,
+            faults,
+            gate.latched,
+            None if self.uploader is None else self.uploader.trouble,
+        )
+
+    def _fields(self, source: str) -> dict[str, str]:
+        """What an entry of systemd's journal says besides its text."""
+        fields = {"ROBOTD_ROBOT": self.assembly.config.robot.name, "ROBOTD_SOURCE": source}
+        status, mission = self.assembly.bus.status.latest, self.mission
+        if status is not None and mission is not None:
+            fields |= {
+                "ROBOTD_SURVEY": mission.config.survey,
+                "ROBOTD_STATE": status.state,
+                "ROBOTD_STOP": str(status.stop),
+            }
+        return fields
 
     async def _note_clock(self) -> None:
         """Note which date the loop's time is; without room for that dates are not sure, but the robot works."""

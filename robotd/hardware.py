@@ -30,6 +30,9 @@ class SerialLink(Protocol):
     def pulse_wake(self, seconds: float) -> None:
         """Hold the wake line (BRC) low for so long, in the background; a link without that line ignores it."""
 
+    def rest(self, seconds: float) -> None:
+        """Bytes may gather for so long before `read` returns them, which saves waking up; 0 ends that."""
+
     def close(self) -> None:
         """Send what is queued, then release the device; safe to call twice."""
 

@@ -165,6 +165,7 @@ class LentLink:
         self._is_open = True
         self._arrived = asyncio.Event()
         self._pulse: asyncio.TimerHandle | None = None
+        self._rest: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
         """Read, and send heartbeats, from now on; needs a running loop."""
@@ -215,6 +216,19 @@ class LentLink:
             log.debug("%s: no wake line: %s", self.port, error)
             return
         self._pulse = self._loop.call_later(seconds, self._end_pulse)
+
+    def rest(self, seconds: float) -> None:
+        """Leave bytes with the kernel, which has room for a second of them, for so long; 0 ends that."""
+        if self._fault is not None:
+            return
+        if self._rest is not None:
+            self._rest.cancel()
+            self._rest = None
+        if seconds > 0.0:
+            self._loop.remove_reader(self._fd)
+            self._rest = self._loop.call_later(seconds, self.rest, 0.0)
+        else:
+            self._loop.add_reader(self._fd, self._on_readable)
 
     def close(self) -> None:
         """Send what is queued, then give the port back; safe to call twice."""
@@ -275,6 +289,8 @@ class LentLink:
         self._fault = f"{self.port}: {fault}"
         self._queue.clear()
         self._beat_timer.cancel()
+        if self._rest is not None:
+            self._rest.cancel()
         self._loop.remove_reader(self._fd)
         self._loop.remove_writer(self._fd)
         self._loop.remove_reader(self._guardian)

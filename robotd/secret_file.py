@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from .errors import ConfigError
+from .errors import ConfigError, DriverFault
 
 LIMIT = 4096  # bytes
 CREDENTIALS = "CREDENTIALS_DIRECTORY"  # systemd.exec(5), LoadCredential=
@@ -53,6 +53,16 @@ def read_credential(name: str, where: str) -> str:
     except OSError as error:
         raise ConfigError(f"{where}: no credential '{name}'; put LoadCredential={name}:FILE into the unit") from error
     return _checked(data, f"{where}: credential '{name}'")
+
+
+def driver_secret(path: Path | None, credential: str | None, where: str) -> str | None:
+    """A driver's secret, from a file or from a credential; None if it has neither. Raises DriverFault."""
+    try:
+        if path is not None:
+            return read_secret(path, where)
+        return None if credential is None else read_credential(credential, where)
+    except ConfigError as error:
+        raise DriverFault(str(error)) from error
 
 
 def _checked(data: bytes, what: str) -> str:

@@ -189,6 +189,10 @@ class LoggedLink:
         self._log.add(now(), "wake", f"{seconds:g}")
         self._link.pulse_wake(seconds)
 
+    def rest(self, seconds: float) -> None:
+        """Let bytes gather."""
+        self._link.rest(seconds)
+
     def close(self) -> None:
         """Release the device, and have the recording written."""
         self._link.close()

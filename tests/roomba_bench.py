@@ -52,8 +52,10 @@ class Bench:
 
     async def open_serial(self, port, baud):
         assert port == PORT
-        self.link = RoombaLink(self.robot, baud)
-        return self.link
+        self.link = link = RoombaLink(self.robot, baud)
+        link.rests = []
+        link.rest = link.rests.append
+        return link
 
     @property
     def frame(self):

@@ -386,6 +386,7 @@ def test_the_log_says_who_asked_for_what_and_is_put_aside_when_long(tmp_path, mo
 @contextmanager
 def program(folder, *arguments, port=0):
     (folder / "token").write_text(TOKEN + "\n")
+    (folder / "token").chmod(0o600)
     watched = folder / "watched"
     watched.mkdir(exist_ok=True)
     command = [
@@ -530,11 +531,12 @@ def test_a_gateway_that_takes_nothing_is_a_fault_until_that_is_mended(tmp_path):
             assert await driver.flash(["A1"], 1.0, [1]) == {}
             await driver.close()
             (tmp_path / "token").write_text("old")
+            (tmp_path / "token").chmod(0o600)
             with pytest.raises(DriverFault, match="refuses: token: missing or wrong"):
                 await driver.open()
             await driver.close()
             (tmp_path / "token").unlink()
-            with pytest.raises(DriverFault, match=r"token_file .* cannot be read"):
+            with pytest.raises(DriverFault, match=r"token_file: .* cannot be read"):
                 await driver.open()
 
         run_virtual(run())
@@ -566,6 +568,7 @@ def impostor(*answers):
 
 def test_the_driver_does_not_trust_whoever_listens(tmp_path):
     (tmp_path / "token").write_text(TOKEN)
+    (tmp_path / "token").chmod(0o600)
 
     async def run():
         for answer, text in (
@@ -588,6 +591,7 @@ def test_the_driver_does_not_trust_whoever_listens(tmp_path):
 
 def test_the_driver_gives_up_on_a_gateway_that_hangs(tmp_path):
     (tmp_path / "token").write_text(TOKEN)
+    (tmp_path / "token").chmod(0o600)
 
     async def run():
         with impostor("hang") as port:

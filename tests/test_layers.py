@@ -51,7 +51,7 @@ LAYERS = {
         "roof_watch",
         "wheel_runs",
         "recorder",
-        "supervisor",
+        *("supervisor", "service"),
         "control_socket",
         "daemon",
         "config_views",

@@ -360,3 +360,25 @@ def test_a_process_that_hung_for_longer_than_the_guardian_waits_writes_nothing_a
         link.close()
 
     asyncio.run(main())
+
+
+def test_at_rest_bytes_gather_and_nobody_is_woken_until_the_time_is_over_or_somebody_is_in_a_hurry(pair):
+    async def main():
+        link = await open_serial(pair.port, 115200)
+        loop = asyncio.get_running_loop()
+        try:
+            for seconds, hurry_s in ((0.1, None), (30.0, 0.05)):
+                begun = loop.time()
+                link.rest(seconds)
+                if hurry_s is not None:
+                    loop.call_later(hurry_s, link.rest, 0.0)
+                os.write(pair.far, b"one")
+                await asyncio.sleep(0.02)
+                os.write(pair.far, b"two")
+                t, data = await link.read()
+                assert data == b"onetwo"
+                assert t - begun >= min(seconds, hurry_s or seconds) - 0.002
+        finally:
+            link.close()
+
+    asyncio.run(main())

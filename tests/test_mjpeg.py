@@ -194,6 +194,7 @@ def test_without_stamps_the_frames_are_dated_more_evenly_than_they_arrive():
 @pytest.mark.parametrize("login", ["basic", "digest"])
 def test_it_logs_in_as_the_camera_wants_and_the_password_is_never_told(login, tmp_path, caplog):
     (tmp_path / "password").write_text("secret\n")
+    (tmp_path / "password").chmod(0o600)
 
     async def steps(server, url):
         driver = a_driver(url, user="viewer", password_file=tmp_path / "password")
@@ -217,15 +218,22 @@ def test_it_logs_in_as_the_camera_wants_and_the_password_is_never_told(login, tm
 
 
 @pytest.mark.parametrize(
-    ("content", "match"), [(None, "cannot be read: No such file"), (b"\n", "is empty"), (b"\xff\xfe", "not UTF-8")]
+    ("content", "match"),
+    [
+        (None, "cannot be read: No such file"),
+        (b"\n", "is empty"),
+        (b"\xff\xfe", "printable ASCII"),
+        (b"open", "chmod 0600"),
+    ],
 )
 def test_a_password_file_that_is_none_is_named(content, match, tmp_path):
     path = tmp_path / "password"
     if content is not None:
         path.write_bytes(content)
+        path.chmod(0o644 if content == b"open" else 0o600)
 
     async def main():
-        with pytest.raises(DriverFault, match=f"password_file .*{match}"):
+        with pytest.raises(DriverFault, match=f"password_file: .*{match}"):
             await a_driver("http://127.0.0.1:1/", user="x", password_file=path).open()
 
     run_virtual(main())
@@ -433,7 +441,7 @@ def test_a_certificate_is_verified(tmp_path):
         ({"url": "rtsp://10.0.0.1/x"}, "found 'rtsp://10.0.0.1/x'; expected an address"),
         ({"url": "http://10.0.0.1:99999/"}, "Port out of range"),
         ({"url": "http://me:secret@10.0.0.1/"}, "use the keys user, password_file"),
-        ({"url": "http://10.0.0.1/", "user": "x"}, "user and password_file belong together"),
+        ({"url": "http://10.0.0.1/", "user": "x"}, "belong together"),
         ({"url": "http://10.0.0.1/", "ca_file": "x"}, "nothing to verify with http"),
         ({"url": "http://10.0.0.1/", "channel": "blue"}, "expected one of .gray., .red."),
         ({"url": "http://10.0.0.1/", "stall_s": 0}, "stall_s: found 0; expected 0.2 to 60"),

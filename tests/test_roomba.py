@@ -251,3 +251,34 @@ def test_ten_minutes_without_a_missed_frame():
         assert (counters.bad_length, counters.bad_order, counters.bad_checksum, counters.skipped_bytes) == (0, 0, 0, 0)
 
     bench_test(scenario)
+
+
+def test_at_rest_frames_are_looked_at_seldom_but_every_change_counts_and_a_wish_ends_it():
+    async def main():
+        bench = Bench()
+        try:
+            await bench.driver.open()
+            bench.running = asyncio.create_task(bench.driver.run())
+            await asyncio.sleep(4.0)
+            assert bench.link.rests == []
+            await asyncio.sleep(2.0)
+            before = len(bench.frames)
+            await asyncio.sleep(2.0)
+            assert set(bench.link.rests) == {0.075}
+            assert len(bench.frames) - before < 80  # of 133: two come together, the simulated line lets none gather
+            bench.body.bump_left = True
+            await asyncio.sleep(0.045)
+            assert bench.frame.bump_left
+            bench.body.bump_left = False
+            bench.driver.arm()
+            assert bench.link.rests[-1] == 0.0
+            await asyncio.sleep(0.5)
+            before, rests = len(bench.frames), len(bench.link.rests)
+            await asyncio.sleep(1.5)
+            assert len(bench.frames) - before == pytest.approx(100, abs=1)
+            assert len(bench.link.rests) == rests
+            assert bench.driver.counters.late == bench.driver.counters.missing == 0
+        finally:
+            await bench.stop()
+
+    run_virtual(main())

@@ -119,6 +119,7 @@ class RoombaLine:
         self._first = baud
         self._checksum: oi.Checksum = checksum
         self._report = report
+        self._is_resting = False  # bytes are gathering
         self._past = LineCounters()
         self._review: tuple[float, LineCounters] | None = None
         self._use(baud, packet_sets(baud)[0])
@@ -276,6 +277,12 @@ class RoombaLine:
 
     # ---- the stream --------------------------------------------------------------------------------------------------
 
+    def rest(self, seconds: float) -> None:
+        """Let frames gather for so long, which saves waking up for each; 0 ends that."""
+        if seconds or self._is_resting:
+            self._is_resting = seconds > 0.0
+            self._link.rest(seconds)
+
     async def read(self) -> list[tuple[float, Values]]:
         """Wait for bytes; returns the frames that they completed, each with the time at which it was taken.
 
@@ -283,7 +290,11 @@ class RoombaLine:
         """
         before = self.arrived
         self.arrived, data = await self._link.read()
-        if self.arrived - before > STALL_S:
+        if self._is_resting:  # nobody knows when these came; what comes next dates them
+            self._is_resting = False
+            self.arrived, more = await self._link.read()
+            data += more
+        elif self.arrived - before > STALL_S:
             data += await self._waiting()
         self.heard += len(data)
         ends: list[int] = []

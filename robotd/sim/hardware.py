@@ -308,6 +308,7 @@ class _TappedLink:
         self._tap = tap
         self.set_baud = link.set_baud
         self.pulse_wake = link.pulse_wake
+        self.rest = link.rest
         self.close = link.close
 
     async def read(self) -> tuple[float, bytes]:

@@ -98,6 +98,9 @@ class RoombaLink:
         self._check()
         self._loop.call_later(seconds, self._roomba.pulse_brc, seconds)
 
+    def rest(self, seconds: float) -> None:
+        """Nobody is woken here, so nothing is saved: bytes come as ever."""
+
     def close(self) -> None:
         """Send what is queued, then release the robot; safe to call twice."""
         self._end("closed")

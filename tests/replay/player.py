@@ -116,6 +116,9 @@ class ReplayLink:
     def pulse_wake(self, seconds: float) -> None:
         self._outcome.note(f"wake {seconds:g}")
 
+    def rest(self, seconds: float) -> None:
+        pass
+
     def close(self) -> None:
         if not self._is_closed:
             self._is_closed = True
