@@ -214,8 +214,7 @@ class FlashDetector:
 
     def _recent(self, since: float = -np.inf) -> tuple[Indices, Floats]:
         """Numbers and times of the frames after `since` within the window."""
-        numbers = np.array([number for number, _ in self._times], np.intp)
-        times = np.array([t for _, t in self._times])
+        numbers, times = (np.array(column) for column in zip(*self._times, strict=True))
         chosen = times > max(since, times[-1] - self._window_s())
         return numbers[chosen], times[chosen]
 

@@ -182,9 +182,9 @@ class Matcher:
 
     @staticmethod
     def _seen(levels: Singles) -> NDArray[np.bool_]:
-        usual = np.median(levels, axis=1, keepdims=True)
+        usual = _middle(levels)
         away = np.abs(levels - usual)
-        spread = 1.48 * np.median(away, axis=1, keepdims=True)
+        spread = 1.48 * _middle(away)
         return np.asarray(away <= _SPREADS * spread + _HIDDEN * usual + 0.15)
 
     def _search(
@@ -305,18 +305,26 @@ def _steadied(values: Singles, levels: Singles, flicker: Singles | None) -> tupl
     """
     if flicker is None:
         return values, levels, np.ones_like(values)
-    usual = np.maximum(np.median(levels, axis=1, keepdims=True), 1e-3)
+    usual = np.maximum(_middle(levels), 1e-3)
     most = 3.0 * np.abs(flicker).max(axis=1, keepdims=True)
     away = np.clip(levels / usual - 1.0, -most, most)
     energy = np.maximum(np.einsum("nf,nf->n", flicker, flicker), 1e-9)
     share = np.clip(np.einsum("nf,nf->n", flicker, away) / energy, 0.0, 2.0)[:, None]
     lamps = np.maximum(1.0 + share * flicker, 0.5).astype(np.float32)
-    return values - np.median(values, axis=1, keepdims=True) * (lamps - 1.0), levels / lamps, lamps
+    return values - _middle(values) * (lamps - 1.0), levels / lamps, lamps
+
+
+def _middle(curves: Singles) -> Singles:
+    """Upper median (N, 1) of curves (N, F), without what numpy's costs for few of them."""
+    half = curves.shape[1] // 2
+    return np.asarray(np.partition(curves, half, axis=1)[:, half : half + 1])
 
 
 def _moved(shifts: Floats) -> Singles:
     """Basis (F, B) of what the shift of the picture does to a place: constant, and if it moved, to second order."""
     constant = np.ones((len(shifts), 1))
+    if not shifts.any():
+        return constant.astype(np.float32)
     centred = shifts - np.median(shifts, axis=0)
     if np.abs(centred).max(initial=0.0) < 1e-9:
         return constant.astype(np.float32)

@@ -8,7 +8,8 @@ import pytest
 from robotd.vision.beacon import BeaconConfig, BeaconDetector
 from tests.roof_film import Film, errors, ramp
 
-SEEDS = range(100, 100 + int(os.environ.get("ROBOTD_ROOF_SEEDS", "40")))
+FIRST = int(os.environ.get("ROBOTD_ROOF_FIRST", "100"))
+SEEDS = range(FIRST, FIRST + int(os.environ.get("ROBOTD_ROOF_SEEDS", "40")))
 STATIC_PX, MOVING_PX = 0.15, 0.5  # rms, asked for
 SPEED_PX = 45.0  # 0.2 m/s where a metre has 225 px
 
