@@ -108,7 +108,9 @@ def rig_survey(
     roofs=False,
     outliers=0.0,
 ):
-    """A survey of turns along the line, the true cameras, the labels' positions, and odometry's true scale and base.
+    """A survey of turns along the line, the true cameras, the labels' positions, and what corrects odometry.
+
+    The last are the factors of all moves' distances and turns.
 
     `nominal` is the standard deviation (radians, metres) by which the survey's idea of the rig is off; `outliers` the
     share of sightings that are wrong, half of them images in glass or floor, half under another label's name.
