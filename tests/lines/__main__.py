@@ -55,6 +55,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="NAME")
     parser.add_argument("--families", nargs="+", default=[""], metavar="PREFIX")
     parser.add_argument("--count", type=int, default=4, metavar="N", help="scenes of each family (default: 4)")
+    parser.add_argument(
+        "--first", type=int, default=0, metavar="N", help="their first number: others than were tuned on"
+    )
     parser.add_argument("--size", nargs="+", type=_size, default=[SIZES[1]], metavar="WxH", help="default: 320x240")
     parser.add_argument("--folder", type=Path, metavar="DIR", help="annotated photographs instead of drawn scenes")
     parser.add_argument("--directions", action="store_true", help="accuracy of clean lines every 5 degrees")
@@ -76,7 +79,7 @@ def _print_table(methods: dict[str, Method], options: argparse.Namespace) -> int
         material = photographs(options.folder)
     else:
         families = [name for name in FAMILIES if name.startswith(tuple(options.families))]
-        material = (scene for size in options.size for scene in scenes(families, options.count, size))
+        material = (scene for size in options.size for scene in scenes(families, options.count, size, options.first))
     scores: dict[str, list[Score]] = {name: [] for name in methods}
     seconds = dict.fromkeys(methods, 0.0)
     worst: list[tuple[float, Scene, list[Line]]] = []

@@ -88,10 +88,10 @@ def scene(family: str, number: int, size: tuple[int, int] = SIZES[0], samples: i
     return Scene(f"{family}/{number}", family, image, truth, polarity, (0.75 * w, 1.35 * w), valid)
 
 
-def scenes(families: list[str], count: int, size: tuple[int, int]) -> Iterator[Scene]:
-    """`count` scenes of every family, one after another."""
+def scenes(families: list[str], count: int, size: tuple[int, int], first: int = 0) -> Iterator[Scene]:
+    """`count` scenes of every family, one after another, numbered from `first` on."""
     for family in families:
-        for number in range(count):
+        for number in range(first, first + count):
             yield scene(family, number, size)
 
 
