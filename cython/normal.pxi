@@ -309,7 +309,7 @@ cdef class Normals(Structure):
 
     cdef void _moves(self, const double* frame, const Shape* loss, Normal* n) noexcept nogil:
         cdef int m, i, j, k, a, b, wa, wb, r
-        cdef double c, s, dx, dy, weight, square, scale, turn
+        cdef double c, s, dx, dy, weight, square, scale, turn, factor
         cdef const double* z
         cdef const double* L
         cdef const double* x
@@ -324,7 +324,8 @@ cdef class Normals(Structure):
         scale, turn = frame[STOP * self.stops + CAMERA * self.cameras], frame[STOP * self.stops + CAMERA * self.cameras + 1]
         for m in range(self.moves):
             a, b = self.before[m], self.after[m]
-            z, L = self.moved + 12 * m, self.moved + 12 * m + 3
+            z, L = self.moved + 13 * m, self.moved + 13 * m + 3
+            factor = L[9]
             x, y = frame + STOP * a, frame + STOP * b
             c, s = cos(x[2]), sin(x[2])
             dx, dy = y[0] - x[0], y[1] - x[1]
@@ -336,10 +337,10 @@ cdef class Normals(Structure):
                 for j in range(3):
                     D[8 * i + j] = -D[8 * i + 3 + j]
             D[2], D[10] = e[1], -e[0]
-            D[6], D[14], D[23] = -z[0], -z[1], -z[2]
-            e[0] -= (1.0 + scale) * z[0]
-            e[1] -= (1.0 + scale) * z[1]
-            e[2] = _wrapped(y[2] - x[2] - z[2]) - turn * z[2]
+            D[6], D[14], D[23] = -factor * z[0], -factor * z[1], -factor * z[2]
+            e[0] -= (1.0 + factor * scale) * z[0]
+            e[1] -= (1.0 + factor * scale) * z[1]
+            e[2] = _wrapped(y[2] - x[2] - z[2]) - factor * turn * z[2]
             square = 0.0
             for i in range(3):
                 whitened[i] = L[3 * i] * e[0] + L[3 * i + 1] * e[1] + L[3 * i + 2] * e[2]

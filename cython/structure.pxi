@@ -51,7 +51,7 @@ cdef class Structure:
     cdef double* t_robot_camera
     cdef int* before
     cdef int* after
-    cdef double* moved  # 3 measured, 9 root of information
+    cdef double* moved  # 3 measured, 9 root of information, 1 if the odometry factors apply, else 0
     cdef int* roof_stop
     cdef double* roof  # 3 beacon, 2 pixels, sigma, 9 homography
     cdef int* known_point
@@ -62,7 +62,8 @@ cdef class Structure:
         const double[:, :, ::1] R_robot_camera, const double[:, ::1] t_robot_camera, const int64_t[::1] stop,
         const int64_t[::1] camera, const int64_t[::1] point, const double[:, ::1] uv, const double[::1] sigma,
         const double[::1] probability, const int64_t[::1] before, const int64_t[::1] after,
-        const double[:, ::1] measured, const double[:, :, ::1] roots, const int64_t[::1] roof_stop,
+        const double[:, ::1] measured, const double[:, :, ::1] roots, const double[::1] by_wheels,
+        const int64_t[::1] roof_stop,
         const double[:, ::1] beacon, const double[:, ::1] roof_uv, const double[::1] roof_sigma,
         const double[:, :, ::1] H_image_world, const int64_t[::1] known_point, const double[:, ::1] known_position,
         const double[::1] known_sigma,
@@ -110,15 +111,16 @@ cdef class Structure:
                 self.t_robot_camera[3 * c + k] = t_robot_camera[c, k]
         self.moves, self.roofs, self.knowns = before.shape[0], roof_stop.shape[0], known_point.shape[0]
         self.before, self.after = arena.ints(self.moves), arena.ints(self.moves)
-        self.moved = arena.doubles(12 * self.moves)
+        self.moved = arena.doubles(13 * self.moves)
         for i in range(self.moves):
             if not 0 <= before[i] < after[i] < stops:
                 raise ValueError(f"a move must lead from an earlier to a later stop, got {before[i]} to {after[i]}")
             self.before[i], self.after[i] = before[i], after[i]
             for k in range(3):
-                self.moved[12 * i + k] = measured[i, k]
+                self.moved[13 * i + k] = measured[i, k]
             for k in range(9):
-                self.moved[12 * i + 3 + k] = roots[i, k // 3, k % 3]
+                self.moved[13 * i + 3 + k] = roots[i, k // 3, k % 3]
+            self.moved[13 * i + 12] = by_wheels[i]
         self.roof_stop, self.roof = arena.ints(self.roofs), arena.doubles(15 * self.roofs)
         for i in range(self.roofs):
             self.roof_stop[i] = roof_stop[i]

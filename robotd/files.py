@@ -227,7 +227,7 @@ def _tidy_survey(table: dict[str, Any]) -> None:
 
 
 def _tidy_stop(stop: dict[str, Any]) -> None:
-    _drop_nulls(stop, "sightings", "beacon_sightings")
+    _drop_nulls(stop, "sightings", "beacon_sightings", "motions")
     stop.setdefault("move", None)
 
 

@@ -144,6 +144,21 @@ class Move:
 
 
 @dataclass(frozen=True, slots=True)
+class Motion:
+    """The same motion as another sensor than the wheels saw it; `source` names it, e.g. "gyro" or "line".
+
+    `information` is the inverse of the covariance of (dx, dy, dheading): zero along what the sensor does not show, as
+    all of dx and dy are for a gyro.
+    """
+
+    source: str
+    dx: float
+    dy: float
+    dheading: float
+    information: Matrix3
+
+
+@dataclass(frozen=True, slots=True)
 class OdometryState:
     """Dead reckoning at time `t`: pose in the odometry frame and metres driven since the start of the leg."""
 
@@ -394,7 +409,7 @@ class BeaconSighting:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A halt at which labels were mapped; `move` leads here from the stop before it in the same leg."""
+    """A halt at which labels were mapped; `move` and `motions` lead here from the stop before it in the same leg."""
 
     leg: int
     stop: int
@@ -403,6 +418,7 @@ class Stop:
     move: Move | None
     sightings: tuple[Sighting, ...] = ()
     beacon_sightings: tuple[BeaconSighting, ...] = ()
+    motions: tuple[Motion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,6 +137,8 @@ def check_stops(
         if before is not None and stop.stop <= before:
             text = "twice" if stop.stop == before else f"after stop {before}"
             problems.add(f"{path}.stop", f"leg {stop.leg} has stop {stop.stop} {text}; expected increasing numbers")
+        if before is None and stop.motions and complete:
+            problems.add(f"{path}.motions", f"is the first stop of leg {stop.leg}; expected none")
         if before is None and stop.move is not None and complete:
             problems.add(f"{path}.move", f"is the first stop of leg {stop.leg}; expected null")
         if before is not None and stop.move is None:
@@ -189,6 +191,10 @@ def check_stop(
     _date(stop.time, f"{path}time", problems)
     if stop.move is not None:
         _covariance(stop.move.covariance, f"{path}move.covariance", problems)
+    for index, motion in _bound(stop.motions):
+        if not motion.source:
+            problems.add(f"{path}motions[{index}].source", "found an empty text; expected the sensor's name")
+        _covariance(motion.information, f"{path}motions[{index}].information", problems, "an information matrix")
     cameras = {camera.name: camera for camera in rig.cameras} if rig else None
     for index, sighting in _bound(stop.sightings if sightings else ()):
         where = f"{path}sightings[{index}]"
@@ -339,7 +345,7 @@ def _scaled(rows: Matrix3) -> tuple[NDArray[np.float64], float]:
     return matrix / scale, scale
 
 
-def _covariance(rows: Matrix3, path: str, problems: Problems) -> None:
+def _covariance(rows: Matrix3, path: str, problems: Problems, what: str = "a covariance") -> None:
     """Symmetric and positive semi-definite, within rounding."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     if b == d and c == g and f == h and a > 0.0 and a * e > b * b:
@@ -348,6 +354,6 @@ def _covariance(rows: Matrix3, path: str, problems: Problems) -> None:
             return  # positive definite by its leading minors (Sylvester), clearly enough for rounding not to matter
     matrix, scale = _scaled(rows)
     if np.abs(matrix - matrix.T).max() > ROUNDING:
-        problems.add(path, "is not symmetric; expected a covariance")
+        problems.add(path, f"is not symmetric; expected {what}")
     elif (smallest := np.linalg.eigvalsh(matrix)[0]) < -ROUNDING:
-        problems.add(path, f"has the negative eigenvalue {smallest * scale:g}; expected a covariance")
+        problems.add(path, f"has the negative eigenvalue {smallest * scale:g}; expected {what}")

@@ -104,6 +104,13 @@ def path_of(line):
     return np.column_stack([xy, np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))]), s
 
 
+def true_moves(store):
+    """(S - 1, 3) between the stops of a store's line."""
+    poses, arc = path_of(store["line"])
+    poses = poses[[int(np.argmin(np.abs(arc - a))) for a in store["line"]["stops"]]]
+    return se2_relative(poses[:-1], poses[1:])
+
+
 def drive(poses, arc, index, world: World, rng) -> list[Move]:
     """Moves between stops as odometry reports them: noise per wheel, scale and base errors, one slip in 20 m."""
     if world.wheel == world.odometry == world.slip == 0.0:

@@ -13,6 +13,7 @@ from robotd.records import (
     BeaconSighting,
     CameraModel,
     KnownLabel,
+    Motion,
     Move,
     Pose,
     Priors,
@@ -84,9 +85,13 @@ def make_problem(priors, lens="brown-conrady", stops=9, labels=40, seed=0, world
         if s and leg == records[-1].leg:
             d = se2_relative(poses[s - 1], pose) + rng.normal(0.0, 0.01, 3)
             move = Move(*d.tolist(), ((1e-4, 0.0, 1e-5), (0.0, 1e-4, 0.0), (1e-5, 0.0, 1e-4)))
-        records.append(
-            Stop(leg, s + 1, "2026-11-21T10:00:00Z", Pose(*pose.tolist()), move, tuple(sightings), tuple(beacons))
-        )
+        motions = ()
+        if move is not None and world == "motions":
+            gyro = Motion("gyro", 0.0, 0.0, move.dheading + 0.01, ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1e5)))
+            line = Motion("line", move.dx, move.dy, move.dheading, ((4e3, 2e3, 0.0), (2e3, 1e3, 0.0), (0.0, 0.0, 1e4)))
+            motions = (gyro, line) if s % 3 else (line,)
+        at = Pose(*pose.tolist())
+        records.append(Stop(leg, s + 1, "2026-11-21T10:00:00Z", at, move, tuple(sightings), tuple(beacons), motions))
     known = tuple(KnownLabel(f"{n:03d}", tuple(points[n].tolist())) for n in range(4)) if world == "known" else ()
     roofs = (RoofCamera("roof", (640, 480), tuple(map(tuple, H.tolist()))),) if world == "roof" else ()
     survey = Survey(
@@ -113,7 +118,7 @@ def test_residuals_are_those_of_numpy(lens):
         np.testing.assert_allclose(found.roof, linear.roof, atol=1e-12)
 
 
-@pytest.mark.parametrize("world", ["stop", "known", "roof"])
+@pytest.mark.parametrize("world", ["stop", "known", "roof", "motions"])
 @pytest.mark.parametrize("priors", [NONE, TILT, ALL], ids=["planar", "tilt", "all"])
 @pytest.mark.parametrize("lens", ["pinhole", "rational", "fisheye"])
 def test_the_descent_takes_the_steps_of_numpy(priors, world, lens):
@@ -155,7 +160,7 @@ def test_what_is_held_fixed_stays_to_the_last_bit():
     np.testing.assert_array_equal(solution.state.frame[fixed], state.frame[fixed])
 
 
-@pytest.mark.parametrize("world", ["stop", "known", "roof"])
+@pytest.mark.parametrize("world", ["stop", "known", "roof", "motions"])
 @pytest.mark.parametrize("priors", [NONE, TILT, ALL], ids=["planar", "tilt", "all"])
 def test_covariances_are_those_of_the_dense_inverse(priors, world):
     problem, state = make_problem(priors, world=world)

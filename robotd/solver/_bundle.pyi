@@ -21,6 +21,7 @@ class Bundle:
         after: NDArray[np.int64],
         measured: NDArray[np.float64],
         roots: NDArray[np.float64],
+        by_wheels: NDArray[np.float64],
         roof_stop: NDArray[np.int64],
         beacon: NDArray[np.float64],
         roof_uv: NDArray[np.float64],

@@ -299,12 +299,13 @@ def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:
         ],
         axis=1,
     )
-    J = np.concatenate([linear.move_before, linear.move_after, linear.move_factor], axis=2)
+    wheels = slice(0, len(m.before))  # the rest are motions by other sensors
+    J = np.concatenate([linear.move_before, linear.move_after, linear.move_factor], axis=2)[wheels]
     good = m.covariance[:, 2, 2] < SLIPPED[2, 2]
     if good.any():
         fitted = np.einsum("mri,mij,mrj->m", J, frame[entries[:, :, None], entries[:, None, :]], J)
         stated = float(np.sqrt(np.mean(m.covariance[good, 2, 2])))
-        squares = float((linear.move[good] ** 2).sum())
+        squares = float((linear.move[wheels][good] ** 2).sum())
         result.append(Scatter("odometry (heading)", stated, "rad", squares, float((3.0 - fitted[good]).sum())))
     if len(linear.roof):
         entries = STOP * problem.roofs.stop[:, None] + np.arange(STOP)

@@ -241,6 +241,7 @@ class Belief:
             labels=tuple(map(str, range(len(self.points)))),
             known=Known(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)),
             moves=_NO_MOVES,
+            motions=problem.motions.select(np.zeros(len(problem.motions.after), dtype=np.bool_)),
             roofs=problem.roofs.select(np.zeros(len(problem.roofs.stop), dtype=np.bool_)),
             leg=np.ones(len(places), dtype=np.int64),
             odometry=places,

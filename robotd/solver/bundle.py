@@ -61,8 +61,8 @@ class Linear:
     """The measurements linearised at a state; every residual and derivative is divided by its standard deviation.
 
     Sightings: `residual` (N, 2), `by_frame` (N, 2, 15) by the stop's 5 and the camera's 10 entries, `by_point`
-    (N, 2, 3), `valid` (N,). Moves: `move` (M, 3), its derivatives (M, 3, 3) by x, y, heading of the stops before and
-    after, and (M, 3, 2) by the odometry factors. Beacons: `roof` (B, 2), `roof_by_stop` (B, 2, 5).
+    (N, 2, 3), `valid` (N,). Moves, then motions: `move` (M, 3), its derivatives (M, 3, 3) by x, y, heading of the stops
+    before and after, and (M, 3, 2) by the odometry factors. Beacons: `roof` (B, 2), `roof_by_stop` (B, 2, 5).
     """
 
     residual: Floats
@@ -130,7 +130,12 @@ class Adjustment:
         self.labels: Ints = np.flatnonzero(seen)
         self.point: Ints = (np.cumsum(seen) - 1)[s.label]
         self.camera_slices = [slice(*np.searchsorted(s.camera, [c, c + 1])) for c in range(len(problem.cameras))]
-        self.move_roots: Floats = np.linalg.inv(np.linalg.cholesky(problem.moves.covariance))
+        moves, motions = problem.moves, problem.motions
+        self.before: Ints = np.concatenate([moves.before, motions.before])
+        self.after: Ints = np.concatenate([moves.after, motions.after])
+        self.measured: Floats = np.concatenate([moves.measured, motions.measured])
+        self.move_roots: Floats = np.concatenate([np.linalg.inv(np.linalg.cholesky(moves.covariance)), motions.root])
+        self.by_wheels: Floats = np.repeat([1.0, 0.0], [len(moves.before), len(motions.before)])
         self.known_here: Ints = np.flatnonzero(seen[problem.known.label])
         self.known_point: Ints = np.searchsorted(self.labels, problem.known.label[self.known_here])
 
@@ -221,22 +226,23 @@ class Adjustment:
         )
 
     def _linear_moves(self, poses: Floats, state: State) -> tuple[Floats, Floats, Floats, Floats]:
-        moves = self.problem.moves
-        if len(moves.before) == 0:
+        measured = self.measured
+        if len(measured) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, ODOMETRY))
-        a, b = poses[moves.before, :3], poses[moves.after, :3]
+        a, b = poses[self.before, :3], poses[self.after, :3]
         R_a_world = heading_matrix(a[:, 2]).transpose(0, 2, 1)
         shift = (R_a_world @ (b - a)[:, :2, None])[:, :, 0]
-        scale, turn = state.frame[-ODOMETRY:]
+        scale, turn = self.by_wheels * state.frame[-ODOMETRY:, None]
         residual = np.empty((len(a), 3))
-        residual[:, :2] = shift - (1.0 + scale) * moves.measured[:, :2]
-        residual[:, 2] = wrap_angle(b[:, 2] - a[:, 2] - moves.measured[:, 2]) - turn * moves.measured[:, 2]
+        residual[:, :2] = shift - (1.0 + scale[:, None]) * measured[:, :2]
+        residual[:, 2] = wrap_angle(b[:, 2] - a[:, 2] - measured[:, 2]) - turn * measured[:, 2]
         after = np.zeros((len(a), 3, 3))
         after[:, :2, :2], after[:, 2, 2] = R_a_world, 1.0
         before = -after
         before[:, 0, 2], before[:, 1, 2] = shift[:, 1], -shift[:, 0]
         factor = np.zeros((len(a), 3, ODOMETRY))
-        factor[:, :2, 0], factor[:, 2, 1] = -moves.measured[:, :2], -moves.measured[:, 2]
+        factor[:, :2, 0] = -self.by_wheels[:, None] * measured[:, :2]
+        factor[:, 2, 1] = -self.by_wheels * measured[:, 2]
         L = self.move_roots
         return (L @ residual[:, :, None])[:, :, 0], L @ before, L @ after, L @ factor
 
@@ -308,14 +314,13 @@ class Adjustment:
         return Normal(H, V, W, gradient, point_gradient)
 
     def _add_moves(self, H: Floats, gradient: Floats, linear: Linear, loss: Loss) -> None:
-        moves = self.problem.moves
-        if len(moves.before) == 0:
+        if len(self.before) == 0:
             return
         _, weight = _cauchy((linear.move**2).sum(axis=1), loss.move_width)
         J = np.concatenate([linear.move_before, linear.move_after, linear.move_factor], axis=2)
         odometry = np.tile(np.arange(-ODOMETRY, 0) + len(self.columns), (len(J), 1))
         entries = np.concatenate(
-            [STOP * moves.before[:, None] + np.arange(3), STOP * moves.after[:, None] + np.arange(3), odometry], axis=1
+            [STOP * self.before[:, None] + np.arange(3), STOP * self.after[:, None] + np.arange(3), odometry], axis=1
         )
         self._add(H, gradient, entries, J * weight[:, None, None], J, linear.move)
 

@@ -20,10 +20,10 @@ from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment, Loss
 from .mapping import to_map
 from .placement import Placement, retriangulate
-from .problem import STOP, Bools, Ints, Moves, Problem, Roofs, Sightings, State, build_problem
+from .problem import STOP, Bools, Ints, Motions, Moves, Problem, Roofs, Sightings, State, build_problem
 from .robust import OUTLIER, Optimum, optimise, ray_tolerance
 
-Arrays = TypeVar("Arrays", Moves, Roofs)
+Arrays = TypeVar("Arrays", Moves, Motions, Roofs)
 
 _NEAR = (Loss("cauchy", 2.5, width=2.0), Loss("geman-mcclure", 0.4))
 _WHOLE = Loss("geman-mcclure")
@@ -158,7 +158,8 @@ class GrowingMap:
             rival=new.rival + int(old.rival.max(initial=-1)) + 1,
             source=new.source + int(old.source.max(initial=-1)) + 1,
         )
-        roofs = alone.roofs.select(alone.roofs.stop == 1)
+        roofs, motions = alone.roofs.select(alone.roofs.stop == 1), alone.motions
+        reached = np.full(len(motions.after), count)
         here = se2_compose(problem.stop_entries(state)[-1, :3], alone.moves.measured[0])
         missing = len(self._number) - len(state.points)
         self._state = State(
@@ -171,6 +172,7 @@ class GrowingMap:
             labels=tuple(self._number),
             sightings=_merged(old, new),
             moves=_joined(problem.moves, replace(alone.moves, before=np.array([count - 1]), after=np.array([count]))),
+            motions=_joined(problem.motions, replace(motions, before=reached - 1, after=reached)),
             roofs=_joined(problem.roofs, replace(roofs, stop=np.full(len(roofs.stop), count))),
             leg=np.append(problem.leg, alone.leg[1]),
             odometry=np.concatenate([problem.odometry, alone.odometry[1:]]),
@@ -220,6 +222,7 @@ def _around_last(problem: Problem) -> Problem:
         prior_sigma=prior,
         sightings=s.select(mine[s.label]),
         moves=_chosen(problem.moves, problem.moves.after == last),
+        motions=problem.motions.select(problem.motions.after == last),
         roofs=problem.roofs.select(problem.roofs.stop == last),
     )
 

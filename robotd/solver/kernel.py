@@ -25,7 +25,7 @@ def compiled(adjustment: Adjustment) -> Bundle | None:
     if Bundle is None:
         return None
     problem, s = adjustment.problem, adjustment.sightings
-    moves, roofs, known = problem.moves, problem.roofs, problem.known
+    roofs, known = problem.roofs, problem.known
     here = adjustment.known_here
     return Bundle(
         problem.stop_count,
@@ -41,10 +41,11 @@ def compiled(adjustment: Adjustment) -> Bundle | None:
         np.ascontiguousarray(s.uv),
         np.ascontiguousarray(s.sigma),
         np.ascontiguousarray(s.probability),
-        moves.before,
-        moves.after,
-        np.ascontiguousarray(moves.measured),
+        adjustment.before,
+        adjustment.after,
+        adjustment.measured,
         adjustment.move_roots,
+        adjustment.by_wheels,
         roofs.stop,
         np.ascontiguousarray(roofs.beacon),
         np.ascontiguousarray(roofs.uv),

@@ -175,6 +175,7 @@ def detach(problem: Problem, placed: Bools) -> Problem:
             measured=moves.measured[keep],
             covariance=moves.covariance[keep],
         ),
+        motions=problem.motions.select(placed[problem.motions.after]),
         roofs=problem.roofs.select(seen),
     )
 

@@ -36,7 +36,7 @@ _SHOWS = 0.9  # probability that a label is seen which nothing is known to hide
 _SIMILAR = np.radians(15.0)  # directions that differ by less are probably hidden by the same things
 _FIELD = np.radians(72.0)  # to either side of its normal in which a label's light shows
 _REACH = 1.1  # times the distance within which 95 % of the sightings lie
-_APART = 0.5  # of the labels' usual distance lies between two stops: nearer ones see them from almost the same side
+_APART = 0.35  # of the labels' usual distance lies between two stops: nearer ones see them from almost the same side
 _LONGEST = 0.75  # of the reach may lie between two stops: farther apart they share too few labels to be joined
 _JOINING = 6  # labels are asked at each stop, where so many show: one wrong name must not turn the robot's pose
 _AS_SURE = 1.1  # times as uncertain the robot's pose may get by leaving labels out: whatever it sees next inherits that
@@ -61,8 +61,8 @@ class PlanSettings:
     stop_s: float = 15.0
     flash_s: float = 0.5
     target_m: float = 0.0
-    least: float = 0.04
-    spare: float = 0.05
+    least: float = 0.02
+    spare: float = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -72,6 +72,24 @@ class Moves:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Motions:
+    """Moves by other sensors than wheels: `before`, `after` (K,) stops, `measured` (K, 3), `root` (K, 3, 3), `source`.
+
+    The root's product R' R is the information; directions that a sensor does not show have none.
+    """
+
+    before: Ints
+    after: Ints
+    measured: Floats
+    root: Floats
+    source: NDArray[np.str_]
+
+    def select(self, keep: Bools) -> Motions:
+        """Some of them."""
+        return Motions(*(getattr(self, name)[keep] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Roofs:
     """Beacons seen by roof cameras: `stop` (B,), `beacon` (B, 3) in robot axes, `uv` (B, 2) and `sigma` (B,) in px.
 
@@ -159,6 +177,7 @@ class Problem:
     labels: tuple[str, ...]
     sightings: Sightings
     moves: Moves
+    motions: Motions
     roofs: Roofs
     known: Known
     leg: Ints
@@ -222,6 +241,7 @@ def build_problem(survey: Survey) -> Problem:
         labels=tuple(labels),
         sightings=sightings,
         moves=moves,
+        motions=_motions(survey),
         roofs=roofs,
         known=known,
         leg=np.array([stop.leg for stop in survey.stops]),
@@ -267,6 +287,11 @@ def _check(survey: Survey) -> Columns:
         numbers = [stop.odometry.x, stop.odometry.y, stop.odometry.heading]
         if stop.move is not None:
             numbers += [stop.move.dx, stop.move.dy, stop.move.dheading, *np.ravel(stop.move.covariance)]
+        for motion in stop.motions:
+            if not np.isfinite([motion.dx, motion.dy, motion.dheading, *np.ravel(motion.information)]).all():
+                problems.append(f"{at}: motion by {motion.source}: expected finite numbers, got {motion}")
+            elif not _semidefinite(motion.information):
+                problems.append(f"{at}: motion by {motion.source}: its information is not positive semidefinite")
         if not np.isfinite(numbers).all():
             problems.append(f"{at}: odometry and move must be finite numbers, got {stop.odometry} and {stop.move}")
         elif stop.move is not None and not _semidefinite(stop.move.covariance):
@@ -351,6 +376,25 @@ def _moves(survey: Survey) -> tuple[Moves, list[str]]:
         )
     index = np.array(after, dtype=np.int64)
     return Moves(index - 1, index, np.array(measured).reshape(-1, 3), np.array(covariance).reshape(-1, 3, 3)), notes
+
+
+def _motions(survey: Survey) -> Motions:
+    rows = [
+        (f, motion)
+        for f in range(1, len(survey.stops))
+        for motion in survey.stops[f].motions
+        if survey.stops[f - 1].leg == survey.stops[f].leg and survey.stops[f].stop == survey.stops[f - 1].stop + 1
+    ]
+    after = np.array([f for f, _ in rows], dtype=np.int64)
+    information = np.array([motion.information for _, motion in rows]).reshape(-1, 3, 3)
+    values, vectors = np.linalg.eigh(information)
+    return Motions(
+        after - 1,
+        after,
+        np.array([[motion.dx, motion.dy, motion.dheading] for _, motion in rows]).reshape(-1, 3),
+        np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1),
+        np.array([motion.source for _, motion in rows], dtype=np.str_),
+    )
 
 
 def _roofs(survey: Survey) -> Roofs:

@@ -272,7 +272,15 @@ def _without_wrong(problem: Problem, state: State) -> Problem:
     everything = Adjustment(problem, problem.sightings)
     linear = everything.residuals(state, SQUARE)
     moves, known, notes = problem.moves, problem.known, list(problem.notes)
-    slipped = (linear.move**2).sum(axis=1) > _SLIP
+    excess = (linear.move**2).sum(axis=1)
+    slipped, motions = excess[: len(moves.before)] > _SLIP, problem.motions
+    wrong = excess[len(moves.before) :] > _SLIP
+    if wrong.any():
+        for k in np.flatnonzero(wrong):
+            stop, sigmas = problem.survey.stops[motions.after[k]], np.sqrt(excess[len(moves.before) + k])
+            at = f"leg {stop.leg} stop {stop.stop}: the motion by {motions.source[k]}"
+            notes.append(f"{at} is {sigmas:.0f} standard deviations from what all else says; it was not used")
+        problem = replace(problem, motions=motions.select(~wrong), notes=tuple(notes))
     if slipped.any():
         covariance_ = np.where(slipped[:, None, None], moves.covariance + SLIPPED, moves.covariance)
         moves = replace(moves, covariance=covariance_)

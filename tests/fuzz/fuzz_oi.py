@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of what parses bytes from a serial line, about it, or from operators, with atheris.
+"""Coverage-guided fuzzing of what parses bytes from a serial line, about it, from operators or files, with atheris.
 
     python -m tests.fuzz.fuzz_oi --seconds 30            every target, one after the other, sharing that time
     python -m tests.fuzz.fuzz_oi --target stream FILE    what a saved input does
@@ -12,19 +12,22 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import math
 import os
 import re
 import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 LAYOUTS = ((29, 13), (43, 44, 35), (7, 9, 10, 11, 12, 14, 21, 22, 25, 26, 35, 43, 44), (100,), (19,), (3, 106))
 KINDS = ("inclusive", "exclusive", "auto")
 LONGEST = 600  # bytes of an input
+SURVEY = Path(__file__).parents[1] / "bench" / "room.survey.json"
 LONG_SONG = 1 + 2 * 16  # values
 
 
@@ -182,6 +185,59 @@ def control(data: bytes) -> None:
         rpc.result(request.id, dict(request.params))
 
 
+def survey(data: bytes) -> None:
+    """A damaged survey is refused in words that name the file, or read, kept and solved without a traceback."""
+    from robotd.errors import InputError, RobotdError
+    from robotd.files import survey_from_json, survey_to_json
+    from robotd.solver import solve
+
+    try:
+        found = survey_from_json(data if data[:1] == b"{" else _damaged(data), "x")
+    except InputError as error:
+        assert error.problems
+        assert all(problem.startswith("x") for problem in error.problems)
+        return
+    assert survey_from_json(survey_to_json(found), "x") == found
+    try:
+        result = solve(found)
+    except RobotdError as error:
+        assert str(error)
+        return
+    for label in result.labels:
+        assert label.position is None or all(map(math.isfinite, label.position))
+        assert label.position is not None or label.reason
+
+
+def _damaged(data: bytes) -> bytes:
+    """A small survey in which every three bytes spoil one value."""
+    table = json.loads(SURVEY.read_bytes())
+    table["stops"] = table["stops"][:3]
+    for stop in table["stops"]:
+        stop["sightings"] = stop["sightings"][:12]
+    places = list(_places(table))
+    for at in range(0, len(data) - 2, 3):
+        holder, key = places[int.from_bytes(data[at : at + 2]) % len(places)]
+        other, name = places[(7 * data[at + 2]) % len(places)]
+        spoilt = (None, -1, 0, 1e300, 1e-300, "", "front", [], {}, [[1]], True, 2**70, 1e6, -0.0, 57.3)
+        kind = data[at + 2] % (len(spoilt) + 2)
+        if kind < len(spoilt):
+            holder[key] = spoilt[kind]
+        elif kind == len(spoilt):
+            there = name in other if isinstance(other, dict) else True
+            holder[key] = json.loads(json.dumps(other[name])) if there else None
+        elif isinstance(holder, dict):
+            holder.pop(key, None)
+    return json.dumps(table).encode()
+
+
+def _places(table: Any) -> Iterator[tuple[Any, Any]]:
+    """Every value of nested tables and lists, as the container and the key in it."""
+    for key, value in list(table.items() if isinstance(table, dict) else enumerate(table)):
+        yield table, key
+        if isinstance(value, dict | list):
+            yield from _places(value)
+
+
 TARGETS: dict[str, Callable[[bytes], None]] = {
     "stream": stream,
     "framed": framed,
@@ -190,6 +246,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "guardian": guardian,
     "recording": recording,
     "control": control,
+    "survey": survey,
 }
 
 
@@ -216,6 +273,8 @@ def _seeds(target: str) -> list[bytes]:
         ]
     if target == "guardian":
         return [b"open 115200 /dev/ttyUSB0", b"beat", b"open x y"]
+    if target == "survey":
+        return [b"", b"\x00\x00\x00", b'{"format": "robotd-survey/1"}', *(bytes((k, 40 * k, k)) for k in range(1, 7))]
     if target == "control":
         words = (
             ("drive", {"t": 1.5, "speed": 0.1}),
@@ -242,9 +301,12 @@ def _run(target: str, seconds: float, files: list[str]) -> None:
             "robotd.serial_log",
             "robotd.rpc",
             "robotd.bind",
+            "robotd.files",
+            "robotd.survey_checks",
         ]
     ):
         import robotd.bind
+        import robotd.files
         import robotd.oi
         import robotd.roomba.firmware
         import robotd.rpc
