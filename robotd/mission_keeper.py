@@ -158,7 +158,7 @@ class MissionKeeper:
         )
         source = LabelSource(
             *(assembly.path.parent, daemon.state, cast(Labels, assembly.labels)),
-            fault=lambda: next(item.fault for item in daemon.supervisors if item.driver is assembly.labels),
+            fault=lambda: next(item.fault for item in daemon.supervisors if item.driver.name == assembly.labels.name),
             uploader=daemon.uploader,
             warn=lambda text: self._say(text, "warning"),
         )

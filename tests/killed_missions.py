@@ -4,11 +4,16 @@ Everything is real but the world: `robotd sim roomba` on a pseudo-terminal, `rob
 upload and control socket, and the server. Missions are short, and observing is quick: one small camera, no light.
 """
 
+import contextlib
 import json
+import os
 import re
 import select
+import signal
 import socket
 import sqlite3
+import subprocess
+import sys
 from contextlib import closing
 
 import msgspec
@@ -62,12 +67,74 @@ TOLD = re.compile(r"mission: stop (\d+) of \d+:")
 POLL_S = 0.1
 
 
+# imports once what every daemon needs, which takes longer than the lives of most; each daemon is a process of its own
+NURSERY = """
+import os, signal, sys
+from robotd.__main__ import main
+import robotd.control_socket, robotd.daemon, robotd.operations, robotd.prompt, robotd.real
+from robotd.plugin import available
+for point in available().values():
+    point.load()
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+print("ready", flush=True)
+for line in sys.stdin:
+    config, log = line.rstrip("\\n").split("\\t")
+    child = os.fork()
+    if not child:
+        os.setsid()
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        os.dup2(os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644), 2)
+        sys.stdin = None
+        os._exit(main(["run", "-c", config]))
+    print(child, flush=True)
+"""
+
+
+class Child:
+    """A daemon from the nursery, as far as a Robot needs it."""
+
+    def __init__(self, pid):
+        self.pid = pid
+
+    def poll(self):
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return -signal.SIGKILL
+        return None
+
+    def wait(self):
+        while self.poll() is None:
+            select.select([], [], [], 0.002)
+
+
+class NurseryRobot(Robot):
+    """A robot whose daemons are forked from one that has imported everything."""
+
+    @contextlib.contextmanager
+    def without_daemon(self):
+        path = os.pathsep.join([str(self.folder), os.getcwd()])
+        command = [sys.executable, "-c", NURSERY]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        with super().without_daemon(), subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, **pipes) as it:
+            self.nursery = it
+            assert it.stdout.readline() == "ready\n"
+            yield self
+            it.stdin.close()
+
+    def begin(self):
+        self._begun = self.log.stat().st_size if self.log.exists() else 0
+        self.nursery.stdin.write(f"{self.folder / 'robotd.toml'}\t{self.log}\n")
+        self.nursery.stdin.flush()
+        self.daemon = Child(int(self.nursery.stdout.readline()))
+
+
 def robot_of(folder, url, *, keep_free_mb=0.0, state=None):
     """A robot whose missions have a stop every SPACING_M."""
     folder.mkdir(parents=True, exist_ok=True)
     stops = [round(SPACING_M * k, 2) for k in range(STOPS)]
     config = MISSION.format(stops=stops, url=url, keep_free_mb=keep_free_mb)
-    robot = Robot(folder, drivers=DRIVERS, config=config, state=state)
+    robot = NurseryRobot(folder, drivers=DRIVERS, config=config, state=state)
     save_calibration(Calibration(cameras=(CAMERA,)), folder / "calibration.toml")
     return robot
 

@@ -5,6 +5,8 @@
 ROBOTD_KILLS sets another number of kills. Power cuts and full disks need root and a loop device.
 """
 
+import asyncio
+import dataclasses
 import os
 import random
 import re
@@ -16,10 +18,23 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from robotd.drivers.line_follower import LineFollowerConfig, LineFollowerDriver
+from robotd.drivers.roomba import RoombaConfig, RoombaDriver
+from robotd.drivers.v4l2 import V4l2Config, V4l2Driver
 
+from robotd.bus import Bus
+from robotd.clock import run_virtual
+from robotd.config import Config, MissionConfig, RobotConfig
+from robotd.daemon import Assembly, Daemon
 from robotd.journal import Journal
+from robotd.plugin import Driver
+from robotd.sim.hardware import FOLDER, SimHardware
+from robotd.sim.layout import Mark
+from robotd.sim.settings import WorldSettings
+from robotd.sim.world import World
 from tests.bad_network import FAULTS, BadNetwork
 from tests.killed_missions import STOPS, TOLD, Lives, ask, pauses, robot_of
+from tests.line_course import store
 
 KILLS = int(os.environ.get("ROBOTD_KILLS", "500"))
 ROBOTS = 4
@@ -84,6 +99,72 @@ def written(pid):
     """Bytes that a process has had written to disks."""
     fields = dict(line.split(": ") for line in Path(f"/proc/{pid}/io").read_text().splitlines())
     return int(fields["write_bytes"])
+
+
+# ---- on the line -----------------------------------------------------------------------------------------------------
+
+
+class Silent(Driver):
+    """A label system that does nothing: there is no camera to see it."""
+
+    async def flash(self, labels, strength, duration):
+        return {}
+
+
+@pytest.mark.parametrize(
+    ("interrupted", "stop_at"),
+    [
+        (("driving", 2), "markers"),
+        (("observing", 2), "markers"),
+        (("driving", 3), "distances"),
+        (("settling", 1), "distances"),
+    ],
+)
+def test_a_mission_that_is_interrupted_on_its_line_stops_where_it_would_have(tmp_path, interrupted, stop_at):
+    layout, shift = store([(0.0, 0.0), (1.2, 0.0)], texture="concrete")
+    places = ((0.5, 0.14, "square"), (0.9, -0.15, "dot"))
+    marks = tuple(Mark((float(x + shift[0]), float(y + shift[1])), shape=shape) for x, y, shape in places)
+    world = World(dataclasses.replace(layout, marks=marks), WorldSettings(), 1, tmp_path)
+    hardware, calibration = SimHardware(world), world.believed_calibration()
+    count = {"marker_stops": 3} if stop_at == "markers" else {"stops": (0.0, 0.5, 0.9)}
+    mission = MissionConfig("line", labels=("a",), stop_at=stop_at, resume="auto", least_labels=0, **count)
+    stood, daemons = {}, []
+
+    async def life(until):
+        bus = Bus()
+        rest = hardware, bus, calibration
+        base = RoombaDriver("base", RoombaConfig(FOLDER + "base"), *rest)
+        eye = V4l2Driver("floor", V4l2Config(FOLDER + "floor"), *rest)
+        follower = LineFollowerDriver("follower", LineFollowerConfig(), *rest)
+        assembly = Assembly(
+            *(tmp_path / "robotd.toml", Config(RobotConfig("r", tmp_path), mission, drivers={}), calibration),
+            *(bus, hardware, base, follower, Silent("labels", None, *rest), {}, eye),
+        )
+        daemons.append(Daemon(assembly))
+        with bus.status.subscribe(size=256) as statuses:
+            running = asyncio.create_task(daemons[-1].run(mission=True))
+            async for status in statuses:
+                if status.state == "observing":
+                    stood[status.stop] = world.body.pose.x - shift[0]
+                if (status.state, status.stop) == until or status.state == "done":
+                    break
+            await asyncio.sleep(0.7)
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+    async def main():
+        await life(interrupted)
+        await asyncio.sleep(3.0)
+        await life(None)
+
+    run_virtual(main())
+    assert daemons[-1].mission.ended is None
+    made = [(stop.leg, stop.stop) for stop in daemons[-1].mission.stops]
+    assert [stop for _, stop in made] == [1, 2, 3]
+    assert made[-1][0] == (1 if interrupted == ("settling", 1) else 2)
+    # by distances, what it rolled in the last second before the interruption is not known
+    assert stood == pytest.approx({1: 0.0, 2: 0.5, 3: 0.9}, abs=0.03 if stop_at == "markers" else 0.3)
+    print(f"\n{stop_at}, {interrupted}: stood at {stood}")
 
 
 # ---- disks -----------------------------------------------------------------------------------------------------------
