@@ -54,7 +54,7 @@ class Wire:
         self.drives = []  # (time of the first byte, right mm/s, left mm/s)
         self._free = 0.0
         self._decoder = oi.CommandDecoder()
-        self.pulse_wake, self.close = link.pulse_wake, link.close
+        self.pulse_wake, self.rest, self.close = link.pulse_wake, link.rest, link.close
 
     async def read(self):
         while True:
