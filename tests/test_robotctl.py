@@ -184,6 +184,57 @@ def test_bash_completes(line, expected):
     assert sorted(shown.split()) == expected
 
 
+@pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("robotctl mis", ["mission"]),
+        ("robotctl mission ", ["abort", "pause", "resume", "start", "status"]),
+        ("robotctl -H ssh://pi@robot drivers re", ["restart"]),
+        ("robotctl logs --le", ["--level"]),
+        ("robotctl beacons o", ["off", "on"]),
+    ],
+)
+def test_fish_completes(line, expected):
+    from robotd.ctl.completion import fish
+
+    command = ["fish", "--no-config", "-c", f"{fish()}\ncomplete -C '{line}'"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert sorted(row.split("\t")[0] for row in shown.splitlines()) == expected
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
+def test_zsh_completes(tmp_path):
+    from robotd.ctl.completion import zsh
+
+    (tmp_path / "robotctl.zsh").write_text(zsh())
+    master, slave = pty.openpty()
+    environment = {"PATH": os.environ["PATH"], "TERM": "dumb", "HOME": str(tmp_path), "PS1": "> "}
+    files = {"stdin": slave, "stdout": slave, "stderr": slave}
+    with subprocess.Popen(["zsh", "-f", "-i"], env=environment, start_new_session=True, **files) as shell:
+        os.close(slave)
+
+        def type_until(keys, words):
+            os.write(master, keys.encode())
+            shown = ""
+            while words not in shown:
+                assert select.select([master], [], [], 20.0)[0], shown
+                shown += os.read(master, 65536).decode(errors="replace")
+
+        try:
+            type_until(f"source {tmp_path}/robotctl.zsh; print rea''dy\n", "ready")
+            for typed, completed in (
+                ("robotctl mis", "robotctl mission "),
+                ("robotctl -H ssh://pi@robot drivers re", "drivers restart"),
+                ("robotctl logs --le", "--level"),
+            ):
+                type_until(f"{typed}\t", completed)
+                type_until("\x15print do''ne\n", "\ndone")
+        finally:
+            shell.kill()
+            os.close(master)
+
+
 # ---- in a terminal ---------------------------------------------------------------------------------------------------
 
 

@@ -49,7 +49,7 @@ def bash() -> str:
 # bash completion of robotctl: source <(robotctl completion bash)
 _robotctl() {{
     local current="${{COMP_WORDS[COMP_CWORD]}}" command="" word skip="" words
-    for word in "${{COMP_WORDS[@]:1:COMP_CWORD-1}}"; do
+    for word in "${{COMP_WORDS[@]:1:$((COMP_CWORD-1))}}"; do
         if [ -n "$skip" ]; then skip=""; continue; fi
         case "$word" in
         -H|--host|--socket) skip=1 ;;

@@ -6,9 +6,9 @@ by way of instructions, because this machine's clock and caches are not a Pi's:
     seconds on the Pi = instructions / (1.2 GHz * 0.42 instructions a cycle)
 
 1.2 GHz is the clock of a Pi 3 B (the B+ has 1.4); with 0.42 the 40 million instructions of `python3 -c pass` take
-0.08 s. valgrind counts the instructions of the start. For what goes along with real time they follow from processor
-time, at the rate that the start reached on this machine in the same run. How late the control loop is called depends on
-the system more than on the daemon, so it stands beside how late a process is called that does nothing else.
+0.08 s. valgrind counts the instructions of the start, and those of a second at rest, without the kernel's. How
+late the control loop is called depends on the system more than on the daemon, so it stands beside how late a process
+is called that does nothing else.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from robotd.config import Calibration, save_calibration
 from robotd.records import CameraModel, Transform
 
 PI_RATE = 1.2e9 * 0.42  # instructions/s of one core of a Pi 3 in Python
-PI_SLOWER = 9.0  # times than this machine, where valgrind is not there to tell
 CAMERAS = ("front", "left", "rear", "right")
 SIZE = (640, 480)
 FPS = 30.0
@@ -197,14 +196,23 @@ class Robot:
         while b"READY=1" not in self.notify.recv(4096):
             pass
 
-    def count_start(self) -> float:
-        """Instructions from the start until it is ready and has ended again; 0 where valgrind is missing."""
-        if shutil.which("valgrind") is None:
-            return 0.0
-        tool = ("valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", "--log-file=valgrind.log")
-        with self.daemon(before=tool):
+    def count(self, seconds: float) -> tuple[float, float]:
+        """Instructions until it is ready, and in a second at rest (without the kernel's)."""
+        tool = ("valgrind", "--tool=callgrind", "--callgrind-out-file=counts", "--log-file=valgrind.log")
+        with self.daemon(before=tool) as process:
             self.wait_ready()
-        return float(re.findall(r"Collected : (\d+)", (self.folder / "valgrind.log").read_text())[-1])
+            self._dump(process.pid)
+            self.wait_log("base found")
+            time.sleep(10.0)  # until the base is at rest
+            self._dump(process.pid)
+            time.sleep(seconds)
+            self._dump(process.pid)
+        parts = sorted(self.folder.glob("counts.*"), key=lambda path: int(path.suffix[1:]))
+        start, _, rest = (float(re.findall(r"totals: (\d+)", path.read_text())[0]) for path in parts[:3])
+        return start, rest / seconds
+
+    def _dump(self, pid: int) -> None:
+        subprocess.run(["callgrind_control", "--dump", str(pid)], check=True, capture_output=True, cwd=self.folder)
 
     def wait_log(self, words: str) -> None:
         """Until the daemon's log has these words."""
@@ -285,15 +293,21 @@ def measure(folder: Path, *, seconds: float) -> None:
     with robot.surroundings():
         with robot.daemon():  # compiles what it imports
             robot.wait_ready()
+        if shutil.which("callgrind_control") is not None:
+            start, rest = robot.count(seconds)
+            print(f"start to ready: {start / 1e9:.2f}e9 instructions, {start / PI_RATE:.2f} s of a Pi 3 (at most 3)")
+            print(f"idle: {rest / 1e6:.1f}e6 instructions/s, {100 * rest / PI_RATE:.2f} % of a Pi 3's core (at most 3)")
+        else:
+            print("valgrind is not installed: no instructions are counted")
         with robot.daemon() as process:
             robot.wait_ready()
-            start_s = cpu_s(process.pid)
+            print(f"start to ready: {cpu_s(process.pid):.2f} s here")
             robot.wait_log("base found")
-            time.sleep(7.0)  # until the base is at rest
+            time.sleep(7.0)
             begun, woken = cpu_s(process.pid), switches(process.pid)
             time.sleep(seconds)
-            idle = (cpu_s(process.pid) - begun) / seconds
-            wakes = (switches(process.pid) - woken) / seconds
+            idle, wakes = (cpu_s(process.pid) - begun) / seconds, (switches(process.pid) - woken) / seconds
+            print(f"idle: {100 * idle:.2f} % of a core here, woken {wakes:.0f} times a second")
             idle_mb = memory_mb(process.pid)
     robot.configure(has_probe=True)
     with robot.surroundings(), robot.daemon("--mission") as process:
@@ -307,15 +321,6 @@ def measure(folder: Path, *, seconds: float) -> None:
     probed = np.array(json.loads((folder / "lateness.json").read_text()))
     late = probed[(probed[:, 0] > since) & (probed[:, 0] < until), 1]
     nothing = np.array(json.loads(done.stdout))
-    count = robot.count_start()
-    factor = count / PI_RATE / start_s if count else PI_SLOWER
-    print(
-        f"one second of this processor is {factor:.1f} s of a Pi 3's; the start takes {count / 1e9:.2f}e9 instructions"
-    )
-    print(f"start to ready: {start_s:.2f} s here, {factor * start_s:.1f} s of a Pi 3 (at most 3)")
-    print(
-        f"idle: {100 * idle:.2f} % here, {100 * factor * idle:.1f} % of a Pi 3's core (at most 3), woken {wakes:.0f}/s"
-    )
     print(f"memory idle: {idle_mb['Rss']:.0f} MB resident, {idle_mb['Pss']:.0f} MB its own share")
     print(
         f"memory searching four cameras: {busy_mb['Rss']:.0f} MB resident (at most 150), {busy_mb['Pss']:.0f} MB share"

@@ -36,6 +36,13 @@ driver = "trial_follower"
 driver = "trial_labels"
 """
 
+# the driver that pushes hangs, and the whole loop with it, when it is told to
+PUSH = "            self.bus.commands.publish(DriveCommand(now(), 0.2, 0.0, self.name))\n"
+HANG = """            import os
+            while os.path.exists("/run/robotd/stuck"):
+                pass
+"""
+
 FILES = {
     "etc/robotd/robotd.toml": CONFIG,
     "etc/robotd/calibration.toml": "",
@@ -114,6 +121,19 @@ def kill_both():
     os.kill(int(pid("robotd-guardian")), 9)
     kill_group()
 
+def stick():
+    open("/run/robotd/stuck", "w").close()  # systemd removes it with the folder when it ends the service
+
+def stop():
+    start = time.monotonic()
+    run("systemctl", "stop", "robotd")
+    taken = time.monotonic() - start
+    return {"taken_s": round(taken, 2), "result": run("systemctl", "show", "-P", "Result", "robotd")}
+
+def entries(*matches):
+    lines = run("journalctl", "-b", "-o", "json", *matches).splitlines()
+    return [json.loads(line) for line in lines]
+
 WAYS = {
     "kill -9 of the daemon": lambda: os.kill(int(pid("robotd")), 9),
     "systemctl kill -s KILL": lambda: run("systemctl", "kill", "-s", "KILL", "robotd"),
@@ -123,6 +143,7 @@ WAYS = {
     "SIGABRT": lambda: run("systemctl", "kill", "-s", "ABRT", "robotd"),
     "kill -9 of the guardian": lambda: os.kill(int(pid("robotd-guardian")), 9),
     "kill -9 of both": kill_both,
+    "a control loop that is stuck": stick,
     "systemctl restart robotd": lambda: run("systemctl", "restart", "--no-block", "robotd"),
     "systemctl restart robotd-guardian": lambda: run("systemctl", "restart", "--no-block", "robotd-guardian"),
 }
@@ -161,11 +182,34 @@ facts = {
     "rss_kb": [int(text.split()[1]) for text in open(f"/proc/{guardian}/status") if text.startswith("VmRSS")][0],
     "daemon_groups": run("sh", "-c", f"grep Groups /proc/{pid('robotd')}/status"),
     "status": run("systemctl", "show", "-P", "StatusText", "robotd-guardian"),
+    "daemon_status": run("systemctl", "show", "-P", "StatusText", "robotd"),
+    "watchdog": len(entries("_PID=1", "UNIT=robotd.service", "UNIT_RESULT=watchdog")),
+    "told": [
+        {name: text for name, text in entry.items() if name in ("MESSAGE", "PRIORITY") or name.startswith("ROBOTD_")}
+        for entry in entries("ROBOTD_SOURCE=base")[:20]
+    ],
+    "listens": run("stat", "-c", "%U:%G %a", "/run/robotd/control.sock"),
 }
-run("systemctl", "stop", "robotd")
+stops = {"driving": stop()}
 halted, taken = wait(is_halted, 10.0)
 seen["systemctl stop robotd"] = {"drives": True, "halted": halted is not None, "halted_s": round(taken, 3)}
-json.dump({"seen": seen, "facts": facts}, open("/trial.json", "w"))
+for pause in (0.2, 1.0):
+    run("systemctl", "start", "--no-block", "robotd")
+    time.sleep(pause)
+    stops[f"{pause} s after the start"] = stop()
+run("systemctl", "start", "robotd")
+wait(drives, 60.0)
+run("systemctl", "stop", "robot")
+time.sleep(2.5)
+facts["status_without_base"] = run("systemctl", "show", "-P", "StatusText", "robotd")
+stops["without its base"] = stop()
+run("systemctl", "start", "robot")
+run("systemctl", "start", "robotd")
+wait(drives, 60.0)
+run("/opt/robotd/bin/robotctl", "estop")
+wait(is_halted, 10.0)
+stops["held by an emergency stop"] = stop()
+json.dump({"seen": seen, "facts": facts, "stops": stops}, open("/trial.json", "w"))
 """
 
 
@@ -223,7 +267,7 @@ def install(tree, folder):
     shutil.copy(ROOT / "systemd" / "robotd-sysusers.conf", tree / "etc" / "sysusers.d" / "robotd.conf")
     inside(tree, "systemd-sysusers")
     site = tree / "opt" / "robotd" / "lib" / "python3.11" / "site-packages"
-    install_drivers(site, PUSHING)
+    install_drivers(site, PUSHING.replace(PUSH, PUSH + HANG))
     for name, text in FILES.items():
         path = tree / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -278,3 +322,27 @@ def test_the_guardian_stands_apart_and_the_daemon_needs_no_rights_to_the_port(tr
     assert facts["user"] not in ("root", "robotd")
     assert facts["socket"].endswith(":robotd 660")
     assert facts["status"].startswith("/run/robot/port is lent to process")
+
+
+def test_a_loop_that_was_stuck_was_ended_by_the_watchdog(trial):
+    assert trial["facts"]["watchdog"] >= 2  # SIGSTOP was the other way to hang
+
+
+def test_every_stop_is_clean_and_takes_less_than_5_s(trial):
+    assert len(trial["stops"]) == 5
+    for state, stop in trial["stops"].items():
+        assert stop["taken_s"] < 5.0, state
+        assert stop["result"] == "success", state
+
+
+def test_systemctl_status_and_the_journal_tell_how_the_robot_fares(trial):
+    facts = trial["facts"]
+    assert facts["daemon_status"].startswith("idle")
+    assert "base: " in facts["status_without_base"]
+    assert facts["listens"] == "robotd:robotd 660"
+    assert {
+        "MESSAGE": "base: base found on /run/robot/port at 115200 baud",
+        "PRIORITY": "6",
+        "ROBOTD_SOURCE": "base",
+        "ROBOTD_ROBOT": "trial",
+    } in facts["told"]
