@@ -28,17 +28,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.reader import make_reader
-from mcap.records import Channel, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
 
 from . import jpeg
 from .errors import InputError
 from .records import Frame
+
+if TYPE_CHECKING:
+    from mcap.records import Message  # loaded by those who record: it takes a Pi a tenth of a second, and 3 MB
 
 FRAME = struct.Struct("<dIHH")
 FRAME_SCHEMA = "robotd.Frame/1"
@@ -96,6 +95,8 @@ class FrameRecorder:
         self._writer: Any = None
 
     def __enter__(self) -> FrameRecorder:
+        from mcap.writer import CompressionType, Writer
+
         self._file = self.path.open("wb")
         self._writer = Writer(self._file, chunk_size=CHUNK, compression=CompressionType.ZSTD)
         self._writer.start(profile="robotd", library="robotd")
@@ -255,6 +256,8 @@ def read_contents(path: Path) -> Contents:
 
 def _summary(path: Path) -> Contents | None:
     """What the index at the end of a whole recording says; None if there is none."""
+    from mcap.reader import make_reader
+
     try:
         with path.open("rb") as file:
             reader = make_reader(file)
@@ -366,6 +369,9 @@ class _Messages:
         self.is_whole = False  # known at the end
 
     def __iter__(self) -> Iterator[tuple[Source, Message]]:
+        from mcap.records import Channel, Message, Metadata, Schema
+        from mcap.stream_reader import StreamReader
+
         schemas: dict[int, str] = {}
         sources: dict[int, Source] = {}
         try:
