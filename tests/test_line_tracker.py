@@ -222,6 +222,23 @@ def test_a_slip_of_a_wheel_is_corrected_within_a_third_of_a_second():
     assert distance_to(near, slipped).max() < 0.012
 
 
+@pytest.mark.parametrize("turn", [-0.13, 0.13])
+def test_a_slip_out_of_sight_is_corrected_by_a_line_that_begins_where_the_memory_ends(turn):
+    """Of a corner that leads out of view no remembered point may come back into it; what comes is some way off then."""
+    path, history, tracker = line_along_x(length=3.0), straight_history(duration=6.0), LineTracker(VIEW)
+    known = path[path[:, 0] < 1.0]
+    drive(tracker, known, history, np.arange(0.0, 2.5, 1 / 30))
+    drive(tracker, None, history, np.arange(2.5, 3.6, 1 / 30), lines=lambda pose: [])
+    pivot = history.at(3.6)[0]
+    c, s = math.cos(-turn), math.sin(-turn)
+    away = path - [pivot.x, pivot.y]
+    slipped = np.column_stack([c * away[:, 0] - s * away[:, 1], s * away[:, 0] + c * away[:, 1]]) + [pivot.x, pivot.y]
+    drive(tracker, slipped[path[:, 0] > 1.05], history, np.arange(3.6, 3.9, 1 / 30))
+    ahead = tracker.path[tracker.path[:, 0] > pivot.x]
+    assert ahead[-1, 0] > 1.5
+    assert distance_to(ahead, slipped).max() < 0.012
+
+
 @pytest.mark.parametrize("stamp_error", [-0.04, 0.0, 0.04])
 def test_the_error_of_the_stamps_is_learned_where_turns_begin_and_end(stamp_error):
     """Turning at 0.6 rad/s, stamps 40 ms off turn what is seen by 24 mrad; on a straight line they turn nothing."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ..records import Floats
-from .line_icp import nearest
+from .line_icp import Nearest, nearest
 from .line_map import LineMap
 from .line_sight import Sight
 from .polyline import arc_length, end_direction
@@ -29,6 +29,9 @@ CROSSES = 0.08  # m to either side of that place that a crossing line shows
 VOTES = 4  # frames that must agree before the path changes
 SURE_VOTES = 8  # the same if the path as remembered is seen as well
 SURE = 0.6  # confidence of a line that may change the path
+STRAIGHT_END = 8  # points at the memory's end that say where it would go on
+STRAIGHT_BOW = 0.006  # m that these may be off a straight line
+SLIP_TURN = 0.22  # radians that a slip out of sight may have turned the line by
 NEAR = 0.12  # m between the places of one junction in different frames
 
 
@@ -196,3 +199,36 @@ def _is_crossed(sights: Sequence[Sight], place: Floats, direction: Floats) -> bo
 
 def _goes_both_ways(branch: Branch, found: Sequence[Branch]) -> bool:
     return any(abs(other.s - branch.s) < NEAR and other.turn * branch.turn < 0.0 for other in found)
+
+
+def past_the_end(line: LineMap, sights: Sequence[Sight], within: float, reach: float) -> tuple[Nearest, Sight] | None:
+    """The sight that goes on where the line ends, off by what a slip out of sight explains, and its match.
+
+    It is matched with the line's end prolonged, which must be straight for that.
+
+    Parameters
+    ----------
+    line : LineMap
+    sights : sequence of Sight
+        Of one frame, in both directions; none lies on the line.
+    within : float
+        Metres that the sight may be off.
+    reach : float
+        Longest gap in metres.
+    """
+    straight = line.path[-STRAIGHT_END:]
+    out = end_direction(straight, math.inf)
+    away = straight - straight[0]
+    if len(straight) < STRAIGHT_END or np.abs(away[:, 0] * out[1] - away[:, 1] * out[0]).max() > STRAIGHT_BOW:
+        return None
+    steps = np.arange(1.0, (reach + within) / line.spacing + STRAIGHT_END)[:, None] * line.spacing
+    prolonged = np.vstack([straight, straight[-1] + steps * out])
+    best: tuple[Nearest, Sight] | None = None
+    for sight in sights:
+        into = -end_direction(sight.points[::-1], REACH)
+        if sight.confidence < SURE or math.acos(np.clip(out @ into, -1.0, 1.0)) > SLIP_TURN:
+            continue
+        match = nearest(sight.points, prolonged, within, arc_length(prolonged))
+        if match.on.sum() >= STRAIGHT_END and (best is None or match.covered > best[0].covered):
+            best = match, sight
+    return best

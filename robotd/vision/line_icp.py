@@ -35,6 +35,11 @@ class Nearest:
     gap: Floats  # (N,) distance, whatever the direction
     normal: Floats  # (N, 2) of the polyline there
 
+    @property
+    def covered(self) -> float:
+        """Metres of the polyline between the first and the last foot."""
+        return float(np.ptp(self.along[self.on]))
+
 
 def nearest(points: Floats, path: Floats, within: float, lengths: Floats) -> Nearest:
     """Project an ordered run of points onto a polyline.

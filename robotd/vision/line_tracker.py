@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Floats, Line, LineMotion, Pose
-from .line_forks import STRAIGHT_ON, Junctions, Rule
+from .line_forks import STRAIGHT_ON, Junctions, Rule, past_the_end
 from .line_icp import SLIPPED, LineOdometer, Nearest, View, solve
 from .line_map import LineMap, approach
 from .line_sight import Motion, PoseHistory, Sight, sights, to_robot
@@ -328,10 +328,10 @@ class LineTracker:
         """Register the sights that lie on the memory, best first, and average them into it."""
         line, config = self._map, self.config
         matches = [(match, sight) for sight in found if (match := line.match(sight, within)) is not None]
-        matches.sort(key=lambda pair: -_covered(pair[0]))
+        matches.sort(key=lambda pair: -pair[0].covered)
         grows = not relaxed and self._may_grow(found)
         for match, sight in matches:
-            if _covered(match) < 3 * config.spacing:
+            if match.covered < 3 * config.spacing:
                 break
             if self._seen is None:
                 self._note(sight)
@@ -339,6 +339,13 @@ class LineTracker:
             fresh = line.match(sight, config.match)
             if fresh is not None:
                 self._merge(fresh, sight, grow=grows)
+        if (
+            self._seen is None
+            and within > config.match
+            and (slipped := past_the_end(line, found, within, self._join_reach()))
+        ):
+            self._note(slipped[1])
+            self._register(*slipped)
         grown = [sight for sight in found if self._continue(sight)] if grows else []
         if self._seen is None and grown:
             self._note(grown[0])
@@ -408,14 +415,17 @@ class LineTracker:
         join = self._join(sight)
         return join is not None and self._map.append(sight.points, 1.0 / self.config.point_sigma**2, join)
 
+    def _join_reach(self) -> float:
+        """Longest gap over which the memory's end may be prolonged."""
+        # a gap that begins where nothing is seen may end where the view begins
+        return self.config.join + (0.0 if self._shown()[-1] else self._blind)
+
     def _join(self, sight: Sight) -> float | None:
         """Longest gap over which a sight may be joined to the memory's end; None if it does not go on from there."""
         gap = sight.points[0] - self.path[-1]
         out, into = self._map.end_direction(), -end_direction(sight.points[::-1], 0.1)
         distance = float(np.hypot(*gap))
-        join = self.config.join
-        if not self._shown()[-1]:  # a gap that begins where nothing is seen: it may end where the view begins
-            join += self._blind
+        join = self._join_reach()
         if distance > join or math.acos(np.clip(out @ into, -1.0, 1.0)) > STRAIGHT_ON:
             return None
         sideways = abs(out[0] * gap[1] - out[1] * gap[0])
@@ -474,8 +484,3 @@ class LineTracker:
         )
         late = math.sqrt(self._covariance[3, 3])
         self._motion = self._odometer.observe(view, now.pose, self.stamp_error, late) or self._motion
-
-
-def _covered(match: Nearest) -> float:
-    """Metres of the line that a sight covers."""
-    return float(np.ptp(match.along[match.on]))
