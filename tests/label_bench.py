@@ -109,7 +109,7 @@ def observe(
         begun = t
         start = np.full(total, np.inf)
         turn = 0
-        for request in requests(question, names, config):
+        for request in requests(question, names, config, delays):
             count = len(request.labels)
             start[question.labels[turn : turn + count]] = system.start(begun + request.after, count)
             turn += count
@@ -142,7 +142,8 @@ def observe(
             flashed = np.zeros(len(truth), bool)
             flashed[lights[noticed <= t]] = True
             earliest = float(seen[noticed <= t].min(initial=np.inf))
-            if inquiry.is_over(t, earliest, flashed):
+            latest = float(over[noticed <= t].max(initial=-np.inf))
+            if inquiry.is_over(t, earliest, latest, flashed):
                 break
         scores = np.tile(DARK * durations.astype(float), (len(truth), 1))
         starts = np.zeros((len(truth), len(durations)))
@@ -170,6 +171,7 @@ def observe(
         outcome.unasked = sum(not inquiry.asked[label] for label in visible)
     outcome.seconds = t - begun_at
     outcome.inquiry = inquiry
+    outcome.truth = truth
     return outcome, t
 
 

@@ -41,6 +41,14 @@ def test_systems_slower_and_later_than_configured_cost_names_and_not_wrong_ones(
         assert result["undecided %"] <= 12.0
 
 
+@pytest.mark.parametrize("rate", [4.0, 20.0])
+def test_a_first_stop_learns_how_many_commands_a_second_the_system_sends(rate):
+    outcome = coded_stops(300, 30, IdentifyConfig(stop_s=200.0), [1], commands_per_s=rate)[0]
+    assert 1.0 / outcome.inquiry.delays.interval == pytest.approx(rate, rel=0.12)
+    assert outcome.wrong == 0
+    assert outcome.right >= 26
+
+
 def test_labels_seen_before_are_named_by_their_place_in_a_short_stop():
     survey = store(3, EIGHT, number=160, stops=9, given=8)
     assert len(survey.per_stop) == 1
@@ -55,7 +63,7 @@ def test_the_decoder_takes_ten_thousand_labels_in_bounded_memory():
     slot = coded_stops(400, 40, EIGHT, [1])[0].inquiry.evidence[0]
     labels = 10_000
     order = rng.permutation(labels)
-    wide = replace(slot, labels=order, symbols=np.arange(labels) % 8, times=np.arange(labels) / 10.0, window=1010.0)
+    wide = replace(slot, labels=order, symbols=np.arange(labels) % 8, gates=np.zeros(labels), window=1010.0)
     found = decode([wide, wide], Prior(np.ones(labels)), len(slot.scores), DelayModel(EIGHT))
     assert len(found.label) == len(slot.scores)
     assert max(len(names) for names, _ in found.candidates) <= 200

@@ -8,14 +8,15 @@ well enough to say where in an image they must appear, that is one more symbol.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Floats
-from .delays import DelayModel, Kernel
+from .delays import DelayModel, Kernel, turns
 from .settings import IdentifyConfig
 
 Singles = NDArray[np.float32]
@@ -26,6 +27,7 @@ TWICE = 0.1  # how likely a label that has its light makes another one in the sa
 LEAST = 1e-4  # probability from which a label is on a light's list of candidates
 LONGEST = 200  # labels on such a list
 _AT_ONCE = 1 << 19  # light-label pairs computed at once: about 10 MB
+SEARCHED = 12  # lights that decide on the throughput
 _NAMED = 0.9  # probability from which a light may teach the delays
 
 
@@ -34,15 +36,15 @@ class Evidence:
     """What one slot asked, and what the lights answered.
 
     `labels` (K,) indices of the labels asked, in the order of the queue, with `symbols` (K,) indices of durations and
-    `times` (K,) seconds in the queue after its first command. `scores` (N, Q) log-likelihood of a flash of each
-    duration at each light relative to darkness, its start uniform over `window` seconds; `starts` (N, Q) the likeliest
-    start, seconds after the slot began. `begun` loop time of the first request.
+    `gates` (K,) seconds after the first request from which on each command may be sent. `scores` (N, Q) log-likelihood
+    of a flash of each duration at each light relative to darkness, its start uniform over `window` seconds; `starts`
+    (N, Q) the likeliest start, seconds after the slot began. `begun` loop time of the first request.
     """
 
     begun: float
     labels: Numbers
     symbols: Numbers
-    times: Floats
+    gates: Floats
     window: float
     scores: Floats
     starts: Floats
@@ -67,12 +69,14 @@ class Posterior:
     """Per light: its likeliest `label`, that one's `probability`, that of `none` of ours, and all `candidates`.
 
     `candidates` holds for every light the labels of probability LEAST or more, likeliest first, and the probabilities.
+    `weight` is the log-likelihood of all that the lights did, up to what does not depend on the delays.
     """
 
     label: Numbers
     probability: Floats
     none: Floats
     candidates: list[tuple[Numbers, Floats]]
+    weight: float = 0.0
 
     def decided(self, threshold: float) -> NDArray[np.bool_]:
         """Lights (N,) that have a name."""
@@ -102,7 +106,7 @@ def decode(evidence: Sequence[Evidence], prior: Prior, lights: int, delays: Dela
         return posterior
     if delays.config.in_order:
         named = np.flatnonzero(posterior.probability >= _NAMED)
-        late = [lateness(slot, posterior, named) for slot in evidence]
+        late = [lateness(slot, posterior, named, delays.interval)[0] for slot in evidence]
         if sum(len(values) for values in late) >= 3:
             fetches = [
                 delays.locate(slot.begun, values, np.ones(len(values)))
@@ -111,8 +115,44 @@ def decode(evidence: Sequence[Evidence], prior: Prior, lights: int, delays: Dela
     return _pass(evidence, prior, lights, delays, fetches, posterior)
 
 
-def lateness(slot: Evidence, posterior: Posterior, lights: Numbers) -> Floats:
-    """Seconds from each label's turn in the queue to the flash of its light, for those lights that flashed as asked."""
+def search_interval(evidence: Sequence[Evidence], prior: Prior, lights: int, delays: DelayModel) -> float:
+    """Seconds between two commands under which the lights' answers are likeliest; `delays` is not changed.
+
+    Notes
+    -----
+    The likelihood has many maxima, one for every way in which some lights fit by accident: a grid over what `delays`
+    holds possible, with a step that moves the end of the longest queue by less than delays differ, so that the true one
+    is not stepped over. The lights that flashed most often decide.
+    """
+    flashed = np.zeros(lights)
+    for slot in evidence:
+        flashed[: len(slot.scores)] += slot.scores.max(axis=1, initial=0.0) > 3.0
+    chosen = np.sort(np.argsort(-flashed, kind="stable")[:SEARCHED])
+    few = [
+        replace(slot, scores=slot.scores[here], starts=slot.starts[here])
+        for slot in evidence
+        for here in [chosen[chosen < len(slot.scores)]]
+    ]
+    prior = replace(prior, ratios=prior.ratios[chosen]) if len(prior.near) else prior
+    longest = max((len(slot.labels) for slot in evidence), default=0)
+    best = (-math.inf, delays.interval)
+    for interval, log_prior in delays.intervals(longest):
+        fetches = [delays.fetch(slot.begun) for slot in few]
+        found = _pass(few, prior, len(chosen), delays, fetches, interval=interval)
+        best = max(best, (found.weight + log_prior, interval))
+    return best[1]
+
+
+def lateness(slot: Evidence, posterior: Posterior, lights: Numbers, interval: float) -> tuple[Floats, Numbers]:
+    """How late those lights were that flashed as asked, their labels' commands being sent `interval` seconds apart.
+
+    Returns
+    -------
+    late : (K,) array
+        Seconds from each label's turn to the flash of its light.
+    turn : (K,) array
+        Place of the label in the queue.
+    """
     place = np.full(int(slot.labels.max(initial=-1)) + 1, -1, np.intp)
     place[slot.labels] = np.arange(len(slot.labels))
     lights = lights[lights < len(slot.scores)]
@@ -123,7 +163,8 @@ def lateness(slot: Evidence, posterior: Posterior, lights: Numbers) -> Floats:
     lights, turn = lights[turn >= 0], turn[turn >= 0]
     symbols = slot.symbols[turn]
     lit = slot.scores[lights, symbols] > np.maximum(slot.scores[lights].max(axis=1, initial=-np.inf) - 1.0, 3.0)
-    return np.asarray((slot.starts[lights, symbols] - slot.times[turn])[lit])
+    late = slot.starts[lights, symbols] - turns(slot.gates, interval)[turn]
+    return np.asarray(late[lit]), np.asarray(turn[lit])
 
 
 def _pass(
@@ -133,49 +174,63 @@ def _pass(
     delays: DelayModel,
     fetches: Sequence[Floats],
     earlier: Posterior | None = None,
+    interval: float | None = None,
 ) -> Posterior:
     config = delays.config
-    taken, owner = np.zeros(0, np.intp), np.zeros(0, np.intp)  # labels that have their light, and which
-    if earlier is not None:
-        named = np.flatnonzero(earlier.decided(config.min_probability))
-        best = named[np.argsort(-earlier.probability[named], kind="stable")]
-        taken, first_of = np.unique(earlier.label[best], return_index=True)
-        owner = best[first_of]
+    times = [turns(slot.gates, interval or delays.interval) for slot in evidence]
+    elsewhere = np.zeros(len(prior.weights))  # how many lights of this stop each label has already, probably
+    claims = [] if earlier is None else earlier.candidates
+    for names, odds in claims:
+        elsewhere[names] += odds
+    again = _again(elsewhere).astype(np.float32)
     kernels = [delays.kernel(slot.begun, fetch, slot.window) for slot, fetch in zip(evidence, fetches, strict=True)]
     weights = prior.weights / max(float(prior.weights.sum()), 1e-30)
     ours = np.log(np.maximum((1.0 - config.none_fraction) * weights, 1e-30)).astype(np.float32)
     label, probability = np.zeros(lights, np.intp), np.zeros(lights)
-    none, candidates = np.zeros(lights), []
+    none, candidates, weight = np.zeros(lights), [], 0.0
     step = max(1, _AT_ONCE // max(1, len(weights)))
     for first in range(0, lights, step):
         part = slice(first, min(first + step, lights))
         total = np.tile(ours, (part.stop - first, 1))
         if len(prior.near):
             total[:, prior.near] += prior.ratios[part].astype(np.float32)
-        total[:, taken] += np.float32(np.log(TWICE))
-        here = (owner >= part.start) & (owner < part.stop)
-        total[owner[here] - part.start, taken[here]] -= np.float32(np.log(TWICE))
+        total += again
+        for row, (names, odds) in zip(total, claims[part], strict=False):  # its own claim does not count
+            row[names] += _again(elsewhere[names] - odds) - again[names]
         nobody = np.full(len(total), np.log(config.none_fraction))
         found = 0
-        for slot, kernel in zip(evidence, kernels, strict=True):
-            _add(slot, kernel, config, part, found, total, nobody)
+        for slot, sent, kernel in zip(evidence, times, kernels, strict=True):
+            _add(slot, sent, kernel, config, part, found, total, nobody)
             found = len(slot.scores)
         top = np.maximum(total.max(axis=1, initial=-np.inf), nobody)
         odds = np.exp(total - top[:, None].astype(np.float32))
         nobody = np.exp(nobody - top)
         whole = odds.sum(axis=1, dtype=float) + nobody
         none[part] = nobody / whole
+        weight += float((top + np.log(whole)).sum())
         label[part] = np.argmax(odds, axis=1) if odds.shape[1] else 0
         for row, sum_ in zip(odds, whole, strict=True):
             kept = np.flatnonzero(row > LEAST * sum_)
             kept = kept[np.argsort(-row[kept], kind="stable")][:LONGEST]
             candidates.append((kept, row[kept] / sum_))
         probability[part] = odds.max(axis=1, initial=0.0) / whole
-    return Posterior(label, probability, none, candidates)
+    return Posterior(label, probability, none, candidates, weight)
+
+
+def _again(lights: Floats) -> Floats:
+    """Log-probability that a label which has so many lights already makes another one, relative to one without."""
+    return np.asarray(np.log(1.0 - (1.0 - TWICE) * np.clip(lights, 0.0, 1.0)))
 
 
 def _add(
-    slot: Evidence, kernel: Kernel, config: IdentifyConfig, part: slice, found: int, total: Singles, nobody: Floats
+    slot: Evidence,
+    times: Floats,
+    kernel: Kernel,
+    config: IdentifyConfig,
+    part: slice,
+    found: int,
+    total: Singles,
+    nobody: Floats,
 ) -> None:
     """Add one slot's log-likelihoods, relative to that of a label that was not asked, for the lights of `part`.
 
@@ -193,7 +248,7 @@ def _add(
     instead = (1.0 - lost) * surprise * other + lost * dark
     right = (1.0 - lost) * (1.0 - surprise) * flash
     if len(slot.labels):
-        late = starts.astype(np.float32)[:, slot.symbols] - slot.times.astype(np.float32)
+        late = starts.astype(np.float32)[:, slot.symbols] - times.astype(np.float32)
         ratio = (right / unasked).astype(np.float32)[:, slot.symbols] * kernel(late)
         ratio += (instead / unasked).astype(np.float32)
         total[:rows, slot.labels] += np.log(np.maximum(ratio, 1e-30))

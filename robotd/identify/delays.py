@@ -3,12 +3,14 @@
 A command waits until the system looks into its folder, then for the commands before it in the queue, then a random
 time on its way. So the moment at which a light flashes says something about which command it obeys: with 10 commands a
 second and delays of about a second, which thirty of them. Poll phase and delays are learnt from the lights that are
-known already: phase on a grid, delays as the mean and deviation of a lognormal distribution under a prior.
+known already: phase on a grid, delays as the mean and deviation of a lognormal distribution under a prior. So is the
+throughput: the time between two commands is the slope of the flashes' moments over their places in the queue.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,15 @@ STRAY = 0.03  # fraction of commands that are overtaken, or delayed in another w
 STAMP_S = 0.15  # frame stamps and the time of a request may disagree by so much
 PRIOR_DELAYS = 20.0  # how many measured delays the configured ones are worth
 TABLE_STEP_S = 0.02
+INTERVAL_SPREAD = 0.35  # of the configured throughput's logarithm: it may be half or twice as much
+KNOWN_SPREAD, RATE_DRIFT = 0.05, 0.01  # spread from which on it counts as known; what remains
 Numbers = NDArray[np.intp]
+
+
+def turns(gates: Floats, interval: float) -> Floats:
+    """Seconds at which commands (K,) are sent one after the other, none before its gate, `interval` seconds apart."""
+    queue = np.arange(len(gates)) * interval
+    return np.asarray(np.maximum.accumulate(gates - queue) + queue)
 
 
 class DelayModel:
@@ -34,10 +44,15 @@ class DelayModel:
     ----------
     median, sigma : float
         Of the delay: its median in seconds, and the standard deviation of its logarithm.
+    interval : float
+        Seconds between two commands, of which `rate_is_known` says whether flashes have shown it.
     """
 
     def __init__(self, config: IdentifyConfig) -> None:
         self.config = config
+        self.interval = 1.0 / config.commands_per_s
+        self._usual = self.interval  # as learnt; a stop's answers may suggest another one meanwhile
+        self._doubt = INTERVAL_SPREAD  # standard deviation of its logarithm
         spread = np.log(config.delay_normal_s / config.delay_median_s) / NORMAL_95
         self._prior = np.array([1.0, np.log(config.delay_median_s), np.log(config.delay_median_s) ** 2 + spread**2])
         self._moments: Floats = PRIOR_DELAYS * self._prior  # number, sum, sum of squares of the logarithms
@@ -61,14 +76,30 @@ class DelayModel:
             "moments": self._moments.tolist(),
             "phases": np.round(self._phases, 6).tolist(),
             "measured": self._measured,
+            "interval": self._usual,
+            "doubt": self._doubt,
         }
 
     def restore(self, state: Mapping[str, Any], *, same_clock: bool) -> None:
         """Take over what an earlier model had learnt; the poll's phase only if the clock has not begun anew."""
         self._moments = np.array(state["moments"])
+        if "interval" in state:  # not in what an earlier release left
+            self._usual = self.interval = state["interval"]
+            self._doubt = state["doubt"]
         phases = np.array(state["phases"])
         if same_clock and phases.shape == self._phases.shape:
             self._phases, self._measured = phases, state["measured"]
+
+    @property
+    def rate_is_known(self) -> bool:
+        return self._doubt < KNOWN_SPREAD
+
+    def intervals(self, number: int) -> Iterator[tuple[float, float]]:
+        """Intervals (s) that may be, with their log-probabilities, so dense that `number` commands tell them apart."""
+        step = min(self.median * self.sigma / max(number * self._usual, 1e-9), 0.25 * self._doubt)
+        most = math.ceil(2.7 * self._doubt / step)
+        for k in range(-most, most + 1):
+            yield self._usual * math.exp(k * step), -0.5 * (k * step / self._doubt) ** 2
 
     def quantile(self, deviations: float) -> float:
         """Delay that is so many standard deviations (of its logarithm) above the median, at most `delay_tail_s`."""
@@ -124,14 +155,15 @@ class DelayModel:
         odds = np.exp(odds - odds.max())
         return np.asarray(odds / odds.sum())
 
-    def learn(self, begun: float, lateness: Floats) -> None:
-        """Take in the lateness (K,) of lights that were named in a slot that began at time `begun`."""
+    def learn(self, begun: float, lateness: Floats, turn: NDArray[np.intp]) -> None:
+        """Take in the lateness (K,) of lights, named in a slot that began at time `begun`, and their `turn` (K,)."""
         if not len(lateness):
             return
         fetch = self.locate(begun, lateness, np.ones(len(lateness)))
         delays = lateness - float(fetch @ self._offsets)
-        delays = delays[(delays > 0.05 * self.median) & (delays < 2.0 * self.config.delay_tail_s)]
-        logs = np.log(delays)
+        usual = (delays > 0.05 * self.median) & (delays < 2.0 * self.config.delay_tail_s)
+        self._learn_interval(lateness[usual], turn[usual])
+        logs = np.log(delays[usual])
         self._moments = np.minimum(1.0, 500.0 / self._moments[0]) * self._moments + [
             len(logs),
             logs.sum(),
@@ -139,6 +171,19 @@ class DelayModel:
         ]
         self._phases = np.roll(fetch, self._shift(begun))
         self._measured = begun
+
+    def _learn_interval(self, lateness: Floats, turn: NDArray[np.intp]) -> None:
+        """Weigh the slope of lateness over the place in the queue against what is known of the interval."""
+        lever = turn - turn.mean() if len(turn) else turn
+        leverage = float((lever * lever).sum()) * self.interval**2
+        if not leverage:
+            return
+        noise = self.median * np.exp(0.5 * self.sigma**2) * max(self.sigma, 0.2)  # of delays, about
+        measured = noise**2 / leverage  # variance of the relative slope
+        gain = self._doubt**2 / (self._doubt**2 + measured)
+        slope = float(lever @ lateness) * self.interval / leverage
+        self._usual = self.interval = self.interval * math.exp(gain * float(np.clip(slope, -0.5, 0.5)))
+        self._doubt = max(math.sqrt(gain * measured), RATE_DRIFT)
 
 
 class Kernel:

@@ -164,7 +164,7 @@ class Identifier:
             return None
         if not self._number:
             self._audited = self._inquiry.audit
-        asked = requests(question, self.labels, self.config)
+        asked = requests(question, self.labels, self.config, self._inquiry.delays)
         self._waiting = Slot(self._number, asked, self._inquiry.longest)
         self._number += 1
         return self._waiting
@@ -187,7 +187,7 @@ class Identifier:
         """True when the slot may end early: what was to flash has flashed and is dark again."""
         if self._begun is None:
             return False
-        earliest = np.inf
+        earliest, latest = np.inf, -np.inf
         flashed: dict[tuple[str, int], bool] = {}
         for name, camera in self._cameras.items():
             until, first, last = camera.activity
@@ -196,8 +196,9 @@ class Identifier:
                 return False
             flashed.update(((name, track), bool(lit)) for track, lit in enumerate(here))
             earliest = min(earliest, float(first.min(initial=np.inf, where=first >= self._begun - STAMP_S)))
-        known = np.array([flashed.get(light, False) for light in self._lights], bool)
-        return self._inquiry.is_over(t, earliest, known)
+            latest = max(latest, float(last.max(initial=-np.inf, where=here)))
+        known = [flashed.pop(light, False) for light in self._lights]
+        return self._inquiry.is_over(t, earliest, latest, np.array([*known, *flashed.values()], bool))
 
     def finish(self, t: float) -> tuple[Sighting, ...]:
         """Every light that was identified; several lights of one label in one camera are rivals."""

@@ -18,14 +18,19 @@ from numpy.typing import NDArray
 
 from ..records import Floats
 from .code import code_words, largest_prime, on_off_words
-from .decoder import Evidence, Numbers, Posterior, Prior, decode, lateness
-from .delays import STAMP_S, DelayModel
+from .decoder import Evidence, Numbers, Posterior, Prior, decode, lateness, search_interval
+from .delays import STAMP_S, DelayModel, turns
+from .pace import SEEN_AFTER, Pace
 from .settings import FlashRequest, IdentifyConfig
 
 Flags = NDArray[np.bool_]
 
-SEEN_AFTER = 2.5  # periods from a flash's start to the decision that it is one
-TRIES, MORE_TRIES = 4, 12  # slots after which a light is left undecided, with many durations and with few
+TRIES, MORE_TRIES = 9, 20  # slots after which a light is left undecided, with many durations and with few
+FIRST_LIGHTS = 60.0  # labels that a stop shows of which nothing is known
+SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput is not known,
+SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
+HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
+AUDITS = 0.25  # of the stops; the others need no slot for it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,12 +53,13 @@ class Candidates:
     def anything(cls, labels: int) -> Candidates:
         """Nothing is known: every label may be visible."""
         flags = np.ones(labels, bool)
-        return cls(np.ones(labels), ~flags, flags, np.zeros(labels, np.intp))
+        return cls(np.full(labels, min(1.0, FIRST_LIGHTS / max(labels, 1))), ~flags, flags, np.zeros(labels, np.intp))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """What one slot asks: `labels` (K,) in the order of the queue, their `symbols` and `times` as in Evidence."""
+    """What one slot asks: `labels` (K,) in the order of the queue, their `symbols` as in Evidence, and the
+    `times` (K,), seconds after the first command, at which they are sent if the throughput is as supposed."""
 
     labels: Numbers
     symbols: Numbers
@@ -71,12 +77,14 @@ class Inquiry:
         self.candidates = candidates
         self.config = config
         self.delays = delays
+        self.pace = Pace(delays)
         self.evidence: list[Evidence] = []
         self.audit: Numbers = np.zeros(0, np.intp)
         self.asked: Flags = np.zeros(len(candidates.weights), bool)  # at this stop
         self._rng = np.random.default_rng(seed)
         self._question: Question | None = None
         self._begun = self._started = math.nan
+        self._gates: Floats = np.zeros(0)
         self._pending: Flags = np.zeros(0, bool)  # lights that the present question is about
         self._words = self._code() if config.scheme == "code" else None
 
@@ -132,7 +140,7 @@ class Inquiry:
     def _word(self, digits: Numbers) -> Question:
         labels = np.flatnonzero((digits >= 0) & self._worth_asking())
         order = labels[np.argsort(-digits[labels], kind="stable")]  # the longest are sent first
-        return Question(order, digits[order], np.arange(len(order)) / self.config.commands_per_s)
+        return Question(order, digits[order], turns(np.zeros(len(order)), self.delays.interval))
 
     def _worth_asking(self) -> Flags:
         return np.asarray(self.candidates.wanted & (self.candidates.weights > 0.0))
@@ -141,22 +149,21 @@ class Inquiry:
         """Everything that may be visible, as far as time allows; what is known to be in view goes first."""
         candidates, config = self.candidates, self.config
         known = self._rng.permutation(np.flatnonzero(candidates.wanted & candidates.expected))
-        self.audit = np.sort(known[: round(config.audit_fraction * len(known) + self._rng.uniform(-0.5, 0.5))])
+        audited = config.audit_fraction / AUDITS * len(known) if self._rng.random() < AUDITS else 0.0
+        self.audit = np.sort(known[: round(audited)])
         others = self._rng.permutation(np.flatnonzero(self._worth_asking() & ~candidates.expected))
         others = others[np.argsort(candidates.asked[others], kind="stable")]
-        most = int(self._first_share * (config.stop_s - self._overhead) * config.commands_per_s) - len(known)
-        others = others[: max(most, 0)]
+        most = self.pace.affordable(len(known), candidates.weights[others], config.stop_s)
+        if not most and not len(known):  # too short a time for names; what can be asked at all may be named later
+            most = max(1, int(0.5 * (config.stop_s - self.pace.overhead) / self.delays.interval))
+        others = others[:most]
         if not len(known) + len(others):
             return None
         groups = [candidates.rivals.get(int(label), label[None]) for label in known]
         lists = [(group, np.full(len(group), 1.0 / len(group))) for group in groups]
         rivals = float(np.quantile([len(group) - 1.0 for group in groups], 0.9)) if groups else 0.0
-        return self._compose(known, others, lists, max(float(len(others)), rivals))
-
-    @property
-    def _first_share(self) -> float:
-        """How much of a stop's time the first question may take, so that what it leaves open can be asked again."""
-        return 0.42 if len(self.config.durations_s) >= 4 else 0.22
+        doubt = float(len(others)) if candidates.weights[others].sum() >= 1.0 else 0.0
+        return self._compose(known, others, lists, max(doubt, rivals))
 
     def _repeat(self, posterior: Posterior, t: float) -> Question | None:
         """Every candidate of every light that is undecided, known labels that did not answer, and the audit."""
@@ -171,19 +178,15 @@ class Inquiry:
         if len(self.evidence) == 1:
             silent = np.setdiff1d(np.flatnonzero(candidates.expected & self.asked), posterior.label[named])
         audit, self.audit = (self.audit, np.zeros(0, np.intp)) if len(self.evidence) == 1 else (silent[:0], self.audit)
-        left = (self._started + config.stop_s - t - self._overhead) * config.commands_per_s
+        left = (self._started + config.stop_s - t - self.pace.overhead) / self.delays.interval
         if not worth and not len(audit):
             return None
         lists = []
-        value = np.zeros(len(candidates.weights))
-        cover = 1.0 - min(max(2.0 / max(len(undecided), 1), 0.01), 0.08)
         for light in undecided:
             labels, odds = posterior.candidates[light]
             kept = candidates.wanted[labels] & self.asked[labels]  # others cannot have lit it
-            labels, odds = labels[kept], odds[kept]
-            enough = int(np.searchsorted(np.cumsum(odds), cover * odds.sum())) + 1
-            value[labels[:enough]] = np.maximum(value[labels[:enough]], odds[:enough])
-            lists.append((labels, odds))
+            lists.append((labels[kept], odds[kept]))
+        value = self.pace.cover(lists, len(candidates.weights), len(audit) + len(silent))
         value[audit] = value[silent] = 1.0
         ask = np.flatnonzero(value)
         ask = ask[np.argsort(-value[ask], kind="stable")][: max(0, int(left))]
@@ -196,11 +199,6 @@ class Inquiry:
         """The slot (N,), counted from 1, in which each light was found."""
         return 1 + np.searchsorted([len(slot.scores) for slot in self.evidence], np.arange(lights), side="right")
 
-    @property
-    def _overhead(self) -> float:
-        """Time of a slot beyond its commands' turns and the flashes' lengths."""
-        return 0.5 * self.config.poll_s + self.delays.quantile(1.645) + SEEN_AFTER * self.config.pattern.period
-
     # ---- symbols -----------------------------------------------------------------------------------------------------
 
     def _compose(
@@ -208,46 +206,20 @@ class Inquiry:
     ) -> Question:
         """Give every label a duration and a time: `listed` ones by what they may be confused with, then the others."""
         number = len(listed) + len(others)
-        alphabet, groups = self._alphabet(number, doubt)
+        plan = self.pace.doubt(number, doubt)
+        alphabet, groups, pause = plan.alphabet, plan.groups, self.pace.pause
         cells, symbols = self._colour(listed, lists, alphabet, groups)
         turn = np.argsort(cells, kind="stable")
         order = np.concatenate([listed[turn], others])
         step = math.ceil(len(others) / max(1, groups)) if not len(listed) else number
         cell = np.concatenate([cells[turn], np.arange(len(others)) // max(1, step) + cells.max(initial=0)])
-        interval = 1.0 / self.config.commands_per_s
-        queue = np.arange(number) * interval
-        gate = cell * self._pause if groups > 1 and number * interval < (groups - 1) * self._pause else 0.0 * cell
-        times = np.maximum.accumulate(gate - queue) + queue
+        paused = groups > 1 and number * self.delays.interval < (groups - 1) * pause
+        times = turns(cell * pause if paused else 0.0 * cell, self.delays.interval)
         symbols = np.concatenate([symbols[turn], np.arange(len(others)) % alphabet])
         durations = np.array(self.config.durations_s[:alphabet])
-        middle = durations[min(3, alphabet - 1)]  # the last ones in a long queue end soon
+        middle = durations[min(2, alphabet - 1)]  # the last ones in a long queue end soon
         fits = (durations[None, :] <= np.maximum(middle, middle - 1 + times[-1] - times)[:, None]).sum(axis=1)
         return Question(order, np.where(symbols < fits, symbols, symbols % fits), times)
-
-    def _alphabet(self, number: int, doubt: float) -> tuple[int, int]:
-        """Number of durations and of groups in the queue with which lights of such doubt are named soonest.
-
-        Each slot divides the odds against a light's label by the number of symbols that can be told apart.
-        """
-        config = self.config
-        width = 4.13 * self.delays.median * self.delays.sigma if config.in_order else math.inf
-        target = 0.3 * (1.0 - config.min_probability) / config.min_probability
-        needed = math.log(max(doubt / max(target, 1e-6), 1.0))
-        best = (math.inf, 1, 1)
-        for groups in range(1, min(number, 12) + 1) if config.in_order else (1,):
-            span = max(number / config.commands_per_s, (groups - 1) * self._pause)
-            times = max(float(groups), span / width)
-            for alphabet in range(1, min(len(config.durations_s), number) + 1):
-                cost = span + self._overhead + config.durations_s[alphabet - 1]
-                gain = math.log(max(alphabet * times, 1.2))
-                best = min(best, (cost * max(1.0, needed / gain), alphabet, groups))
-        return best[1], best[2]
-
-    @property
-    def _pause(self) -> float:
-        """Time between two groups of the queue that can be told apart, in whole polls."""
-        apart = 4.0 * self.delays.median * max(self.delays.sigma, 0.3)
-        return self.config.poll_s * math.ceil(apart / self.config.poll_s) if self.config.poll_s else apart
 
     def _colour(
         self, labels: Numbers, lists: Sequence[tuple[Numbers, Floats]], alphabet: int, groups: int
@@ -256,7 +228,7 @@ class Inquiry:
 
         Labels come in the order of their importance. Neighbouring parts of the queue overlap by a quarter.
         """
-        room = self.config.commands_per_s * self._pause
+        room = self.pace.pause / self.delays.interval
         parts = max(groups, math.ceil(len(labels) / room)) if self.config.in_order else 1
         room = max(room, math.ceil(len(labels) / parts))
         place = np.full(len(self.candidates.weights), -1, np.intp)
@@ -289,17 +261,20 @@ class Inquiry:
 
     def begin(self, t: float) -> None:
         """The question is being sent, from time `t` on."""
+        assert self._question is not None
         self._begun = t
+        self._gates = releases(self._question.times, self.delays)
 
     @property
     def longest(self) -> float:
         """Seconds after which every flash of the present question has ended, or its command counts as lost."""
         assert self._question is not None
         config = self.config
-        ends = self._question.times + np.array(config.durations_s)[self._question.symbols]
+        late = 1.0 if self.delays.rate_is_known or self.evidence else SLOWEST
+        ends = late * self._question.times + np.array(config.durations_s)[self._question.symbols]
         return float(ends.max()) + config.poll_s + config.delay_tail_s + SEEN_AFTER * config.pattern.period + 0.5
 
-    def is_over(self, t: float, earliest: float, flashed: Flags) -> bool:
+    def is_over(self, t: float, earliest: float, latest: float, flashed: Flags) -> bool:
         """Whether waiting longer would tell little; no light may be flashing.
 
         Parameters
@@ -308,6 +283,8 @@ class Inquiry:
             Up to which the cameras' frames were looked at for flashes.
         earliest : float
             Start of the first flash since `begin`, inf if there was none.
+        latest : float
+            Last moment since `begin` at which any light flashed, -inf if none did.
         flashed : (N,) bool array
             Lights that have flashed since `begin`; those of the posterior first.
         """
@@ -318,10 +295,17 @@ class Inquiry:
         seen = SEEN_AFTER * self.config.pattern.period
         pending = self._pending
         about = np.zeros(0, bool) if not len(pending) else flashed[: len(pending)][pending]
-        if len(about) and about.all() and not self.candidates.expected.any():
+        sent = t >= fetched + float(self._question.times[-1])  # what still waits would delay the next question
+        if sent and len(about) and about.all() and not self.candidates.expected.any():
             return True
         if self.config.scheme == "one at a time" and flashed.any():
             return True
+        if (
+            not self.delays.rate_is_known and not self.evidence and flashed.any()
+        ):  # the queue may be slower than thought
+            gap = (latest - earliest) / int(flashed.sum())
+            if t < latest + SILENCE * gap:
+                return False
         deviations = 1.645 if self._question.times[-1] > self.delays.quantile(1.0) else 2.1
         return t >= fetched + float(self._question.times[-1]) + self.delays.quantile(deviations) + seen
 
@@ -331,35 +315,54 @@ class Inquiry:
         question = self._question
         window = max(ended - self._begun + STAMP_S, 1.0)
         self.evidence.append(
-            Evidence(self._begun, question.labels, question.symbols, question.times, window, scores, starts)
+            Evidence(self._begun, question.labels, question.symbols, self._gates, window, scores, starts)
         )
         self._question = None
 
     def posterior(self, prior: Prior, lights: int) -> Posterior:
-        """Names of the lights after the answers so far."""
+        """Names of the lights after the answers so far, and the throughput that explains these best."""
+        if not self.delays.rate_is_known and self._is_long and self.config.in_order:
+            self.delays.interval = search_interval(self.evidence, prior, lights, self.delays)
         return decode(self.evidence, prior, lights, self.delays)
 
     def learn(self, posterior: Posterior) -> None:
         """Let the delays be learnt from the lights that are named; at the end of a stop."""
         named = np.flatnonzero(posterior.probability >= max(0.99, self.config.min_probability))
         for slot in self.evidence:
-            self.delays.learn(slot.begun, lateness(slot, posterior, named))
+            self.delays.learn(slot.begun, *lateness(slot, posterior, named, self.delays.interval))
+
+    @property
+    def _is_long(self) -> bool:
+        """Whether a queue took so long that the throughput shows."""
+        number = max((len(slot.labels) for slot in self.evidence), default=0)
+        return number * self.delays.interval > 4.0 * self.delays.median * self.delays.sigma
 
 
-def requests(question: Question, names: Sequence[str], config: IdentifyConfig) -> tuple[FlashRequest, ...]:
-    """The requests that put a question to the label system, in portions of what it sends between two polls.
+def releases(times: Floats, delays: DelayModel) -> Floats:
+    """When each command (K,) is handed to the label system, which sends them at `times`: seconds after the first one.
 
-    A portion goes out one poll before its turn, so that the queue never runs dry, unless there is a pause before it.
+    A portion of what is sent between two polls goes out one poll before its turn, so that the queue never runs dry, and
+    earlier while the system may be faster than supposed, unless there is a pause before it.
     """
-    length = config.poll_s or 3.0
-    portions = np.floor(question.times / length + 1e-9).astype(int)
+    length = delays.config.poll_s or 3.0
+    pauses = np.diff(times, prepend=0.0) > 0.5 * length + delays.interval
+    hurry = 1.0 if pauses.any() or delays.rate_is_known else HURRY
+    portions = np.floor(times * hurry / length + 1e-9)
+    first = pauses | (np.diff(portions, prepend=0.0) > 0.0)
+    first[:1] = True
+    follows = ~pauses[first]
+    after = np.maximum(0.0, length * (portions[first] - follows))
+    return np.asarray(after[np.cumsum(first) - 1])
+
+
+def requests(
+    question: Question, names: Sequence[str], config: IdentifyConfig, delays: DelayModel
+) -> tuple[FlashRequest, ...]:
+    """The requests that put a question to the label system, each to be sent at its time of `releases`."""
+    after = releases(question.times, delays)
     asked = []
-    end = -math.inf
-    for portion in np.unique(portions):
-        here = np.flatnonzero(portions == portion)
-        follows = question.times[here[0]] - end < 0.5 * length
-        after = max(0.0, length * (portion - 1 if follows else portion))
+    for moment in np.unique(after):
+        here = np.flatnonzero(after == moment)
         durations = tuple(config.durations_s[symbol] for symbol in question.symbols[here])
-        asked.append(FlashRequest(tuple(names[label] for label in question.labels[here]), durations, after))
-        end = float(question.times[here[-1]])
+        asked.append(FlashRequest(tuple(names[label] for label in question.labels[here]), durations, float(moment)))
     return tuple(asked)

@@ -19,7 +19,7 @@ from ..geometry.camera import Camera
 from ..geometry.transforms import invert_rigid, pose_matrix, transform_points
 from ..records import CameraModel, Floats, Pose, Sighting
 from .decoder import Numbers, Prior
-from .inquiry import Candidates
+from .inquiry import FIRST_LIGHTS, Candidates
 from .settings import IdentifyConfig
 
 HEADING_NOISE = 0.018  # rad of odometry's heading after one metre, growing with the root of the distance
@@ -32,9 +32,9 @@ POINT_WEIGHTS = np.exp(-0.5 * POINTS**2) / np.exp(-0.5 * POINTS**2).sum()
 SHOWS = 0.9  # probability that a label which is predicted to be in view can be seen
 FORGETS = 0.6  # factor of that for each time in a row that it could not
 ELSEWHERE = 0.003  # the same of a label whose place is known and out of view
-UNLIKELY_S = 3.0  # spent on labels that are known and probably not in view
+UNLIKELY_S = 1.5  # spent on labels that are known and probably not in view
 EXPECTED = 0.3  # from which on a label is asked as one that is in view
-NEW_LIGHTS, FIRST_LIGHTS = 10.0, 40.0  # labels never seen before that a stop shows; the first stop
+NEW_LIGHTS = 10.0  # labels never seen before that a stop shows, unless it is the first one
 REACH = 1.25  # times the distance within which 95 % of the sightings lie: further labels do not show
 NARROW = 0.35  # cosine of the angle between two directions to a label from which on it may not show from the second
 RARELY = 0.15  # probability that such a label shows

@@ -16,7 +16,9 @@ class IdentifyConfig:
 
     scheme: Literal["adaptive", "code", "one at a time"] = "adaptive"
     poll_s: float = ranged(3.0, minimum=0.0, maximum=60.0, doc="the label system looks for requests this often")
-    commands_per_s: float = ranged(10.0, minimum=0.01, maximum=1e4, doc="commands that it sends per second")
+    commands_per_s: float = ranged(
+        10.0, minimum=0.01, maximum=1e4, doc="commands that it sends per second, until flashes have shown it"
+    )
     in_order: bool = True
     delay_median_s: float = ranged(1.0, minimum=0.01, maximum=60.0, doc="delay of a command, median")
     delay_normal_s: float = ranged(3.0, minimum=0.01, maximum=60.0, doc="and what 95 % of them stay below")
@@ -25,7 +27,7 @@ class IdentifyConfig:
     durations_s: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8, 9)
     stop_s: float = ranged(130.0, minimum=10.0, maximum=7200.0, doc="time that the flashes of one stop may take")
     check_digits: int = ranged(2, minimum=0, maximum=30, doc="scheme code: slots beyond those that tell labels apart")
-    max_slots: int = ranged(12, minimum=1, maximum=1000, doc="slots of one stop at most")
+    max_slots: int = ranged(30, minimum=1, maximum=1000, doc="slots of one stop at most")
     repeat_fraction: float = ranged(0.03, minimum=0.0, maximum=1.0, doc="undecided fraction that is worth a slot")
     audit_fraction: float = ranged(0.05, minimum=0.0, maximum=1.0, doc="known labels that are asked twice, as a check")
     min_probability: float = ranged(0.998, minimum=0.5, maximum=1.0, doc="below it a light is undecided")
