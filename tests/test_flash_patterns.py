@@ -63,6 +63,13 @@ def test_flashes_that_drift_from_between_two_exposures_into_one_are_learnt_toget
     assert np.array(learnt.on) == pytest.approx(np.array(PATTERNS[3].on), abs=0.006)
 
 
+def test_short_weak_flashes_are_learnt_though_noise_has_much_of_the_energy():
+    times, light = light_curve(PATTERNS[3], noise=0.19, seed=3)
+    learnt = learn_trace(times, light)
+    assert learnt.pattern.period == pytest.approx(1.0, abs=0.003)
+    assert np.array(learnt.pattern.on) == pytest.approx(np.array(PATTERNS[3].on), abs=0.015)
+
+
 def test_the_dark_before_and_after_the_flashes_does_not_matter():
     learnt = learn_trace(*light_curve(FlashPattern(), 14.0, seed=3, lit=(4.0, 10.0)))
     assert learnt.pattern.period == pytest.approx(1.0, abs=0.01)

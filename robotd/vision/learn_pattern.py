@@ -273,7 +273,7 @@ class _Fit:
         rates = np.arange(1.0 / longest, 1.0 / shortest, step)
         left = np.array([_left(self.times, y, 1.0 / rate, self.pace) for rate in rates])
         best = int(np.argmin(left))
-        if left[best] > 1.0 - _LEAST_EXPLAINED:
+        if left[best] > 1.0 - self._least_explained():
             raise InputError("its light does not repeat")
         chosen = rates[best], left[best]
         for divisor in range(12, 0, -1):
@@ -288,6 +288,12 @@ class _Fit:
             scores = np.array([_left(self.times, y, 1.0 / r, self.pace) for r in fine])
             rate = float(fine[scores <= scores.min() + 0.01].mean())  # because the fold's bins make a plateau
         return 1.0 / rate
+
+    def _least_explained(self) -> float:
+        """Share of the energy that a pattern must explain: of short, weak flashes much of the energy is noise."""
+        noise = float(np.quantile(np.abs(np.diff(self.curve)), 0.25)) / 0.45  # most frames change by noise alone
+        energy = float(np.var(self.curve))
+        return max(_LEAST_EXPLAINED * (1.0 - noise**2 / max(energy, 1e-12)), 0.5 * _LEAST_EXPLAINED)
 
     # ---- edges -------------------------------------------------------------------------------------------------------
 
@@ -425,7 +431,7 @@ class _Fit:
         energy = np.minimum((self.curve - np.median(self.curve)) ** 2, (2.0 * max(self.light, 1e-9)) ** 2)
         left = np.minimum(residual**2, (2.0 * max(self.light, 1e-9)) ** 2)
         explained = 1.0 - float(left.sum() / max(energy.sum(), 1e-12))
-        if self.light < _LEAST_CONTRAST * self.noise or explained < _LEAST_EXPLAINED:
+        if self.light < _LEAST_CONTRAST * self.noise or explained < self._least_explained():
             raise InputError("its light repeats, but not as flashes of one brightness")
         light, losses = self.light, [self._loss(on, self.period) for on in self._rivals()]
         self.light = light
