@@ -134,6 +134,21 @@ def test_over_free_floor_no_place_comes_near_a_label():
     assert not behind.any()
 
 
+def test_over_free_floor_the_nearest_place_comes_first(begun):
+    study = plan(begun, free=True, settings=PlanSettings(most_stops=3))
+    assert 1 <= len(study.plan.stops) <= 3
+    assert study.plan.distances() == ()
+    here = np.array([study.map.stops[-1].x, study.map.stops[-1].y])
+    away = [float(np.hypot(stop.pose.x - here[0], stop.pose.y - here[1])) for stop in study.plan.stops]
+    assert away[0] == min(away)
+
+
+def test_without_a_line_the_way_so_far_is_planned_once_more(begun):
+    study = plan(begun, settings=PlanSettings(most_stops=2))
+    assert study.plan.begin == 0.0
+    assert all(0.0 <= along <= 1.6 for along in study.plan.distances())
+
+
 def test_on_a_line_that_crosses_itself_the_robot_is_where_it_came_to():
     turn = np.linspace(0.0, 2.0 * np.pi, 200)
     line = np.column_stack([np.sin(2.0 * turn), np.sin(turn)])  # a figure of eight through the origin

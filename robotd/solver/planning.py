@@ -61,8 +61,8 @@ class PlanSettings:
     stop_s: float = 15.0
     flash_s: float = 0.5
     target_m: float = 0.0
-    least: float = 0.02
-    spare: float = 0.01
+    least: float = 0.01
+    spare: float = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)

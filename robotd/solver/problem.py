@@ -58,6 +58,10 @@ class Sightings:
 
     def select(self, keep: Bools | Ints) -> Sightings:
         """Some of the sightings."""
+        if keep.dtype == np.bool_:
+            if keep.all():
+                return self
+            keep = np.flatnonzero(keep)  # once, not once a column: large stores have a hundred thousand
         return Sightings(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
