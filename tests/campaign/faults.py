@@ -1,6 +1,6 @@
 """Kills, power cuts, full disks and bad networks on whole missions: no finished stop is lost or doubled.
 
-    python -m pytest tests/campaign/faults.py -s        500 kills, 20 power cuts; about ten minutes of computing
+    python -m pytest tests/campaign/faults.py -s      500 kills, 20 power cuts: minutes of computing, an hour of waiting
 
 ROBOTD_KILLS sets another number of kills. Power cuts and full disks need root and a loop device.
 """
