@@ -372,6 +372,20 @@ def test_a_crossing_right_before_a_gap_is_no_corner(angle, behind):
     assert tracker.path[-1, 0] > 1.6
 
 
+def test_a_crossing_a_little_before_a_gap_is_no_corner():
+    """The line goes on for a hand's breadth behind the arm that was taken for its own way on."""
+    path, across = line_along_x(length=4.0), np.vstack([bent(250.0)[:0:-1], bent(70.0)])
+    near, beyond = path[path[:, 0] < 1.35], path[path[:, 0] > 1.52]
+
+    def lines(pose):
+        return many(np.vstack([TRUNK, bent(70.0)]))(pose) if pose.x < 0.35 else many(near, across, beyond)(pose)
+
+    tracker = LineTracker(VIEW)
+    drive(tracker, None, straight_history(duration=6.0), np.arange(0.0, 4.0, 1 / 30), lines=lines)
+    assert np.abs(tracker.path[:, 1]).max() < 0.008
+    assert tracker.path[-1, 0] > 1.6
+
+
 def test_a_corner_before_another_line_is_still_a_corner():
     """Another piece of tape lies straight on behind our right angle, but nothing crosses there."""
     beyond = line_along_x(length=4.0)

@@ -24,6 +24,7 @@ LEAVES = 0.015  # m from the line's middle at which a branch leaves it
 PARALLEL = math.radians(20.0)  # branches that differ by less are one line
 BACK = math.radians(135.0)  # nobody turns by more at a junction
 STRAIGHT_ON = math.radians(37.0)  # across a gap
+SHORTEST = 0.08  # m of it straight on behind a crossing, before a gap
 BRIDGE = 0.28  # m from where the line is crossed to where it goes on behind a gap
 CROSSES = 0.08  # m to either side of that place that a crossing line shows
 VOTES = 4  # frames that must agree before the path changes
@@ -37,13 +38,16 @@ NEAR = 0.12  # m between the places of one junction in different frames
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Branch:
-    """A way on from arc length `s` of the remembered line; `turn` against the line's direction before it."""
+    """A way on from arc length `s` of the remembered line; `turn` against the line's direction before it.
+
+    One that is short or lies behind a gap counts only if another line crosses there.
+    """
 
     s: float
     points: Floats
     turn: float
     direction: float
-    behind_gap: bool = False
+    if_crossed: bool = False
 
 
 class Junctions:
@@ -103,10 +107,10 @@ class Junctions:
                 is_real = seen > 0.5 * min(REACH, own_length)
                 if is_real and (not differs or score > self._score(own_turn, own_direction) - 0.1):
                     continue
-                if branch.behind_gap and not (differs and _is_crossed(sights, line.point_at(branch.s), own)):
+                if branch.if_crossed and not (differs and _is_crossed(sights, line.point_at(branch.s), own)):
                     continue
                 votes = SURE_VOTES if is_real else VOTES
-            elif branch.behind_gap:
+            elif branch.if_crossed:
                 continue  # the end itself grows across a gap
             elif own_length > 2.5 * line.spacing and abs(branch.turn) < STRAIGHT_ON:
                 continue  # the end itself grows by what is seen beyond it
@@ -152,21 +156,24 @@ class Junctions:
         else:
             first = int(found.gap.argmin())
             passes = bool(found.gap[first] <= PASSING)
-            on_ahead = _straight_on(line, sight, behind_gap=not passes)
+            on_ahead = _straight_on(line, sight, if_crossed=not passes)
             if on_ahead is not None or not passes:
                 return on_ahead
             away = np.hypot(*(line.path - sight.points[first]).T)
             s = float(lengths[int(away.argmin())])
         points = sight.points[first:]
-        if len(points) < 3 or arc_length(points)[-1] < LEAST or s < 0.05:
+        length = arc_length(points)[-1] if len(points) >= 3 else 0.0
+        if length < SHORTEST or s < 0.05:
             return None
         chord = -end_direction(points[::-1], REACH)
         before = line.direction_at(s, -0.10)
         turn = math.atan2(before[0] * chord[1] - before[1] * chord[0], float(before @ chord))
-        return Branch(s, points, turn, math.atan2(chord[1], chord[0]))
+        if length < LEAST and abs(turn) > PARALLEL:
+            return None
+        return Branch(s, points, turn, math.atan2(chord[1], chord[0]), if_crossed=bool(length < LEAST))
 
 
-def _straight_on(line: LineMap, sight: Sight, *, behind_gap: bool) -> Branch | None:
+def _straight_on(line: LineMap, sight: Sight, *, if_crossed: bool) -> Branch | None:
     """A sight as the straight way on from where the line turns off: its beginning, prolonged backwards, lies on it."""
     back = end_direction(sight.points[::-1], REACH)
     bridge = sight.points[0] + np.arange(BRIDGE, 0.0, -line.spacing)[:, None] * back
@@ -179,7 +186,7 @@ def _straight_on(line: LineMap, sight: Sight, *, behind_gap: bool) -> Branch | N
     turn = math.atan2(before[1] * back[0] - before[0] * back[1], -float(before @ back))
     if abs(turn) > STRAIGHT_ON:
         return None
-    return Branch(s, sight.points, turn, math.atan2(-back[1], -back[0]), behind_gap)
+    return Branch(s, sight.points, turn, math.atan2(-back[1], -back[0]), if_crossed)
 
 
 def _is_crossed(sights: Sequence[Sight], place: Floats, direction: Floats) -> bool:
