@@ -377,13 +377,12 @@ class FlashDetector:
         turn /= cv2.blur(strength, (11, 11))
         del strength
         turn /= (1.0 + self._refused) ** 2
-        turn[over <= _CLEAR] = 0.0
-        clear = self._peaks(turn, 2 * self.config.max_candidates // 3)
+        clear = self._peaks(np.where(over > _CLEAR, turn, np.float32(0.0)), 2 * self.config.max_candidates // 3)
         # what is weaker, or found no room among the strong, has its turn before what was examined in vain
         over *= over > 1.0
-        over /= 1.0 + self._refused
+        over *= turn
         over.ravel()[clear] = 0.0
-        peaks = np.concatenate([clear, self._peaks(over, self.config.max_candidates // 3)])
+        peaks = np.concatenate([clear, self._peaks(over, self.config.max_candidates - len(clear))])
         rows, columns = np.divmod(peaks, over.shape[1])
         return np.ascontiguousarray(rows), np.ascontiguousarray(columns)
 
