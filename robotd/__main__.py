@@ -295,21 +295,22 @@ def check(path: Path) -> int:
 
 def run(path: Path, *, mission: bool) -> int:
     """Run the daemon until SIGTERM or SIGINT, or until its mission has ended."""
-    from .control_socket import ControlSocket
-    from .daemon import Daemon, assemble
     from .notify import notify
-    from .operations import Operations
-    from .prompt import converse
-    from .real import RealHardware
-    from .service import keep_memory_together, keep_pauses_short, log_handler
+    from .service import keep_memory_together, loading, log_handler
 
     keep_memory_together()
-    logging.basicConfig(level=logging.INFO, handlers=[log_handler()])
-    hardware = RealHardware()
-    assembly = assemble(path, hardware)
-    hardware.guardian = path.parent / assembly.config.robot.guardian
-    daemon = Daemon(assembly)
-    keep_pauses_short()
+    with loading():
+        from .control_socket import ControlSocket
+        from .daemon import Daemon, assemble
+        from .operations import Operations
+        from .prompt import converse
+        from .real import RealHardware
+
+        logging.basicConfig(level=logging.INFO, handlers=[log_handler()])
+        hardware = RealHardware()
+        assembly = assemble(path, hardware)
+        hardware.guardian = path.parent / assembly.config.robot.guardian
+        daemon = Daemon(assembly)
 
     async def until_told() -> None:
         control = ControlSocket(path.parent / assembly.config.robot.control, Operations(daemon))

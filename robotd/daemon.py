@@ -425,7 +425,7 @@ class Daemon:
     def _line(self) -> str:
         """What `systemctl status` shows."""
         gate = self.control.gate
-        faults = [f"{item.driver.name}: {item.fault}" for item in self.supervisors if item.fault is not None]
+        faults = [item.fault for item in self.supervisors if item.fault is not None]
         return describe(
             self.assembly.bus.status.latest,
             faults,

@@ -10,7 +10,7 @@ import os
 import socket
 import struct
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from .clock import ticks
 from .notify import notify
@@ -57,6 +57,7 @@ class JournalHandler(logging.Handler):
 
     def __init__(self, address: str = JOURNAL) -> None:
         super().__init__()
+        self.setFormatter(logging.Formatter("%(message)s"))  # basicConfig gives its own to handlers that have none
         self._address = address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
 
@@ -98,15 +99,20 @@ def keep_memory_together() -> None:
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)
 
 
-def keep_pauses_short() -> None:
-    """To be called when all is loaded: what is there stays, so the garbage collector need not look at it again.
+@contextlib.contextmanager
+def loading() -> Iterator[None]:
+    """Load everything inside: what is there afterwards stays, so the garbage collector never looks at it again.
 
     A full collection of what is imported takes 10 ms here and ten times that on a Pi, with the control loop standing
-    still. And a thread that wants to run waits 1 ms for one that computes in Python, not 5 ms.
+    still. And from then on a thread that wants to run waits 1 ms for one that computes in Python, not 5 ms.
     """
-    gc.collect()
-    gc.freeze()
-    sys.setswitchinterval(SWITCH_S)
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+        sys.setswitchinterval(SWITCH_S)
 
 
 def _field(name: str, value: object) -> bytes:

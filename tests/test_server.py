@@ -23,6 +23,8 @@ from urllib.parse import quote
 
 import pytest
 import uvicorn
+from hypothesis import given
+from hypothesis import strategies as st
 
 from robotd.config import Config, UploadConfig
 from robotd.doctor import check_server
@@ -398,6 +400,47 @@ class DieOnce:
 
 
 die_once = DieOnce()
+
+
+# ---- nonsense --------------------------------------------------------------------------------------------------------
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@st.composite
+def spoilt(draw, body):
+    """A record as robots send it, with one value, key or stretch of bytes that no robot sends."""
+    if draw(st.booleans()):
+        at = draw(st.integers(0, len(body)))
+        return body[:at] + draw(st.binary(max_size=8)) + body[draw(st.integers(at, len(body))) :]
+    whole = json.loads(body)
+    part = whole
+    while isinstance(part, (dict, list)) and part:
+        key = draw(st.sampled_from(sorted(part))) if isinstance(part, dict) else draw(st.integers(0, len(part) - 1))
+        if draw(st.booleans()) or not isinstance(part[key], (dict, list)) or not part[key]:
+            part[key] = draw(VALUES)
+            break
+        part = part[key]
+    return json.dumps(whole).encode()
+
+
+def test_no_record_however_spoilt_makes_the_server_fail_or_change_what_it_has(server):
+    put_survey(server, 1, 2)
+    before = server("GET", ROOM)
+    places = [ROOM, f"{ROOM}/legs/1/stops/1", f"{ROOM}/legs/1/stops/2", "/api/surveys/other", f"{ROOM}/legs/0/stops/x"]
+
+    @given(st.sampled_from(places), spoilt(header_body(HEADER)) | spoilt(stop_body(make_stop(2))))
+    def put(place, body):
+        status, answer = server("PUT", place, body)
+        assert status < 500, answer
+        assert status in (200, 201) or answer["problems"]
+
+    put()
+    assert server("GET", ROOM) == before
 
 
 # ---- the program -----------------------------------------------------------------------------------------------------

@@ -27,6 +27,10 @@ def record(text, **fields):
 
 def test_a_journal_entry_carries_its_fields_and_lines(journald):
     handler = JournalHandler(journald.getsockname())
+    before = logging.root.handlers
+    logging.root.handlers = []
+    logging.basicConfig(handlers=[handler])  # as robotd does
+    logging.root.handlers = before
     handler.emit(record("base: unplugged\nplug it in", ROBOTD_SOURCE="base", ROBOTD_STOP="3"))
     handler.close()
     entry = journald.recv(65536)
