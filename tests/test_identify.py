@@ -12,6 +12,7 @@ from robotd.identify.code import code_words, largest_prime, on_off_words
 from robotd.identify.decoder import Evidence, Posterior, Prior, decode
 from robotd.identify.delays import DelayModel, turns
 from robotd.identify.inquiry import Candidates, Inquiry, requests
+from tests.label_bench import coded_stops
 
 CONFIG = IdentifyConfig()
 DURATIONS = np.array(CONFIG.durations_s)
@@ -310,7 +311,15 @@ def test_one_at_a_time_asks_one_label_a_slot():
     for label in range(3):
         assert inquiry.next_question(None, 20.0 * label).labels.tolist() == [label]
         answer(inquiry, 20.0 * label)
-    assert inquiry.next_question(doubt([[0, 1]]), 60.0) is None
+    assert inquiry.next_question(doubt([[2, 1], [2, 0]]), 60.0).labels.tolist() == [2]  # whose light is in doubt
+    answer(inquiry, 60.0)
+    named = Posterior(np.array([2]), np.array([0.9999]), np.zeros(1), [(np.array([2]), np.array([0.9999]))])
+    assert inquiry.next_question(named, 80.0) is None
+
+
+def test_labels_that_are_asked_one_at_a_time_get_their_names():
+    outcome = coded_stops(8, 6, IdentifyConfig(scheme="one at a time"), [0])[0]
+    assert (outcome.right, outcome.wrong) == (6, 0)
 
 
 def test_the_scheme_of_fixed_words_sends_the_words():

@@ -109,6 +109,16 @@ COMMANDS: dict[str, tuple[str, str, list[Option]]] = {
         "commands.beacons",
         [(("switch",), {"nargs": "?", "choices": ("on", "off"), "help": "default: leave them as they are"})],
     ),
+    "prompts": (
+        "what the robot asks of a person, e.g. to have labels flash",
+        "prompts.prompts",
+        [(("-f", "--follow"), {"action": "store_true", "help": "and answer it by typing, until Ctrl-C"})],
+    ),
+    "answer": (
+        "answer what was asked last",
+        "prompts.answer",
+        [(("text",), {"nargs": "*", "metavar": "WORD", "help": "default: done"})],
+    ),
     "wake": ("wake a base that does not answer", "commands.wake", []),
     "dock": ("drive onto the charger; Ctrl-C ends that", "commands.dock", []),
     "calibrate odometry": (

@@ -30,6 +30,7 @@ FIRST_LIGHTS = 60.0  # labels that a stop shows of which nothing is known
 SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput is not known,
 SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
+SINGLES = 3  # slots for each label when they are asked one at a time
 AUDITS = 0.25  # of the stops; the others need no slot for it
 
 
@@ -106,7 +107,7 @@ class Inquiry:
         question = None
         if number < self._most_slots and self.candidates.wanted.any():
             if self.config.scheme == "one at a time":
-                question = self._single(number)
+                question = self._single(number, posterior)
             elif self._words is not None and number < self._words.shape[1]:
                 question = self._word(self._words[:, number])
             elif number == 0 or posterior is None:
@@ -131,11 +132,20 @@ class Inquiry:
         words, planned = code_words(labels, largest_prime(durations), self.config.check_digits)
         return words[:, :planned]
 
-    def _single(self, number: int) -> Question | None:
+    def _single(self, number: int, posterior: Posterior | None) -> Question | None:
+        """Every label by itself; then the likeliest ones of the lights that one flash does not name."""
         here = np.flatnonzero(self._worth_asking())
-        if number >= len(here):
+        if number < len(here):
+            return Question(here[number : number + 1], np.zeros(1, np.intp), np.zeros(1))
+        if posterior is None or number >= SINGLES * len(here):
             return None
-        return Question(here[number : number + 1], np.zeros(1, np.intp), np.zeros(1))
+        value = np.zeros(len(self.candidates.weights))
+        for light in np.flatnonzero(posterior.open(self.config.min_probability)):
+            labels, odds = posterior.candidates[light]
+            value[labels] += odds
+        value[~self._worth_asking()] = 0.0
+        likeliest = np.array([np.argmax(value)], np.intp)
+        return Question(likeliest, np.zeros(1, np.intp), np.zeros(1)) if value.any() else None
 
     def _word(self, digits: Numbers) -> Question:
         labels = np.flatnonzero((digits >= 0) & self._worth_asking())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ from .spot import Spot, fit_spot, light_table
 
 Floats = NDArray[np.float64]
 
+KEPT_BYTES = 12 << 20  # of patches: half a minute of sixty lights
 SIZE = 15  # px; a light of sigma 2 px with room for the constant around it
 _WHITE = 250  # grey level from which a pixel counts as clipped
 _HIDDEN = 0.12  # relative change of the patch's border that says somebody stands before it
@@ -30,7 +32,10 @@ class _Place:
 
 
 class PatchRecorder:
-    """Keeps patches of every frame until `forget`; `grow` turns those of one flash into a better amplitude image."""
+    """Keeps patches of the latest frames (KEPT_BYTES) until `forget`.
+
+    `grow` turns those of one flash into a better amplitude image.
+    """
 
     def __init__(self, pattern: FlashPattern, exposure: float, gamma: float) -> None:
         self._pattern = pattern
@@ -38,8 +43,9 @@ class PatchRecorder:
         self._light = light_table(gamma, 256)
         self._places: list[_Place] = []
         self._corners = np.zeros((2, 0), np.intp)  # first row and column of each place
-        self._times: list[float] = []
-        self._patches: list[NDArray[np.uint8]] = []
+        self._times: deque[float] = deque()
+        self._patches: deque[NDArray[np.uint8]] = deque()
+        self.kept_bytes = 0
 
     def add(self, u: float, v: float, shape: tuple[int, ...]) -> None:
         """Begin to record around pixel (u, v) of images of this shape (H, W)."""
@@ -59,11 +65,16 @@ class PatchRecorder:
         kernels.cut_patches(np.ascontiguousarray(image), self._corners[0], self._corners[1], patches)
         self._times.append(t)
         self._patches.append(patches)
+        self.kept_bytes += patches.nbytes
+        while self.kept_bytes > KEPT_BYTES:
+            self._times.popleft()
+            self.kept_bytes -= self._patches.popleft().nbytes
 
     def forget(self) -> None:
         """Drop the recorded frames; what `grow` made of them stays."""
         self._times.clear()
         self._patches.clear()
+        self.kept_bytes = 0
 
     def grow(self, index: int, start: float, periods: int) -> None:
         """Add the flash of place `index` that began at `start` to its amplitude image.
@@ -76,17 +87,17 @@ class PatchRecorder:
         place = self._places[index]
         period = self._pattern.period
         chosen = [
-            k
-            for k, t in enumerate(self._times)
-            if -0.5 * period <= t - start <= (periods + 0.3) * period and len(self._patches[k]) > index
+            (t, patches[index])
+            for t, patches in zip(self._times, self._patches, strict=True)
+            if -0.5 * period <= t - start <= (periods + 0.3) * period and len(patches) > index
         ]
         if len(chosen) < 8:
             return
-        grey = np.stack([self._patches[k][index] for k in chosen])
+        grey = np.stack([patch for _, patch in chosen])
         border = np.concatenate([grey[:, 0], grey[:, -1], grey[:, :, 0], grey[:, :, -1]], axis=1).mean(axis=1)
         usual = float(np.median(border))
         clear = np.abs(border - usual) <= _HIDDEN * usual + 1.0
-        times = np.array([self._times[k] for k in chosen])[clear]
+        times = np.array([t for t, _ in chosen])[clear]
         pattern = self._pattern.coverage(times - start, self._exposure, periods)
         wave = pattern - pattern.mean()
         weight = float(wave @ wave)
