@@ -375,7 +375,7 @@ def test_a_crossing_right_before_a_gap_is_no_corner(angle, behind):
 def test_a_crossing_a_little_before_a_gap_is_no_corner():
     """The line goes on for a hand's breadth behind the arm that was taken for its own way on."""
     path, across = line_along_x(length=4.0), np.vstack([bent(250.0)[:0:-1], bent(70.0)])
-    near, beyond = path[path[:, 0] < 1.35], path[path[:, 0] > 1.52]
+    near, beyond = path[path[:, 0] < 1.34], path[path[:, 0] > 1.5]
 
     def lines(pose):
         return many(np.vstack([TRUNK, bent(70.0)]))(pose) if pose.x < 0.35 else many(near, across, beyond)(pose)
