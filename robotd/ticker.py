@@ -3,8 +3,8 @@
 The thread is there because a callback can hold the event loop for ten milliseconds, longer than a roof camera can bear.
 It asks to be scheduled before ordinary threads (round robin, the lowest real-time priority), because on busy cores a
 thread that wakes up may otherwise wait for the time slices of several others; it needs some microseconds each time.
-Where that is not allowed (LimitRTPRIO= in the unit) it runs as others do. What remains is Python code that holds the
-interpreter.
+Where that is not allowed (it takes LimitRTPRIO=1 and RestrictRealtime=no in the unit) it runs as others do. What
+remains is Python code that holds the interpreter.
 
 Deadlines are absolute: start + k * period, so that lateness never adds up.
 """
@@ -31,7 +31,8 @@ def prompt_threads() -> Iterator[None]:
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
     except OSError as error:
-        log.debug("threads have no real-time priority: %s; set LimitRTPRIO=1 in the unit", error)
+        hint = "set LimitRTPRIO=1 and RestrictRealtime=no in the unit"
+        log.debug("threads have no real-time priority: %s; %s", error, hint)
         yield
         return
     try:
