@@ -45,13 +45,16 @@ def draw_rig(path: Path, result: RigCalibration) -> None:
         x, y, _ = camera.model.T_robot_camera.translation
         look = rotation_matrix(camera.model.T_robot_camera.rotation)[:2, 2] * _LOOK_M
         top.annotate("", (x + look[0], y + look[1]), (x, y), arrowprops={"arrowstyle": "->", "color": INK})
+        top.update_datalim([(x + look[0], y + look[1])])  # an annotation beyond the axes would not be drawn
         top.add_patch(Circle((x, y), _SPREAD * camera.rig_sigma[1], fill=False, color=RING, linewidth=1.6))
         top.annotate(_plain(camera.model.name), (x, y), xytext=(4, -12), textcoords="offset points", color=INK)
     for name, (x, y, _) in result.beacons.items():
         top.plot(x, y, "*", color=ARROW)
         top.annotate(_plain(name), (x, y), xytext=(4, 4), textcoords="offset points", color=ARROW)
     top.plot(0.0, 0.0, "+", color=MUTED, markersize=10)
-    top.margins(0.25)
+    top.margins(0.15)
+    top.autoscale_view()
+    top.locator_params(nbins=5)
     top.set(aspect="equal", xlabel="x, forward (m)", ylabel="y, left (m)")
     top.set_title(f"from above; green: {_SPREAD:.0f} sigma in the rig", size=10, color=INK)
     for k, camera in enumerate(result.cameras):
