@@ -251,12 +251,18 @@ def test_without_any_device_the_daemon_reports_retries_and_ends_cleanly(tmp_path
         environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
         command = [sys.executable, "-m", "robotd", "run", "-c", str(tmp_path / "robotd.toml")]
         with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
-            assert manager.recv(1000) == b"READY=1\nSTATUS=ready"
-            while manager.recv(1000) != b"WATCHDOG=1":
-                pass
+            try:
+                assert manager.recv(1000).startswith(b"READY=1\nSTATUS=idle")
+                while manager.recv(1000) != b"WATCHDOG=1":
+                    pass
+            except BaseException:
+                process.kill()
+                raise
             missing = {"base", "front", "left", "rear", "right", "floor", "labels"}
             while missing:  # every device is reported, one after the other
-                missing.discard(process.stderr.readline().removeprefix("ERROR ").split(":")[0])
+                line = process.stderr.readline()
+                assert line, f"ended before it complained of {missing}"
+                missing.discard(line.removeprefix("ERROR ").split(":")[0])
             process.send_signal(signal.SIGTERM)
             _, shown = process.communicate(timeout=30)
     assert process.returncode == 0, shown

@@ -256,7 +256,7 @@ def test_what_was_learnt_of_labels_and_their_system_is_taken_over_but_no_places(
     before.memory.learnt.add("c")
     before.refused["b"] = before.refused["c"] = "unknown"
     before.memory.refused |= {"b", "c"}
-    before._delays.learn(10.0, np.array([1.5, 2.0, 2.5]))
+    before._delays.learn(10.0, np.array([1.5, 2.0, 2.5]), np.arange(3))
     after.restore(before.state(), same_clock=True)
     assert after.memory.asked.tolist() == [3, 1, 0]
     assert (after.memory.learnt, after.memory.refused, after.refused) == ({"c"}, {"c"}, {"c": "unknown"})

@@ -47,6 +47,20 @@ def test_a_stale_socket_is_no_reason_to_die(tmp_path, monkeypatch):
     assert not notify("WATCHDOG=1")
 
 
+@pytest.mark.usefixtures("sender")
+def test_a_manager_that_does_not_read_holds_nobody_up(tmp_path, monkeypatch):
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        for _ in range(1000):
+            if not notify("WATCHDOG=1"):
+                break
+        else:
+            pytest.fail("a thousand messages that nobody reads were all said to be delivered")
+        assert listener.recv(100) == b"WATCHDOG=1"
+        assert notify("STATUS=read again")
+
+
 def test_the_watchdog_is_fed_three_times_per_period(monkeypatch):
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
