@@ -75,6 +75,7 @@ def observe(
     candidates=None,
     places=None,
     prior=None,
+    align=None,
     labels=None,
     miss=0.03,
     false=0.01,
@@ -153,7 +154,10 @@ def observe(
                 starts[int(light)] = begin - begun
         scores[known:][scores[known:].max(axis=1) < 0.0] = 0.0  # not found yet: nothing is known of them
         inquiry.answer(scores, starts, t)
-        posterior = inquiry.posterior(priors(), len(truth))
+        for _ in range(2):  # as the Identifier does
+            posterior = inquiry.posterior(priors(), len(truth))
+            if align is None or not align(np.array(where), posterior):
+                break
         outcome.slots.append((len(question.labels), round(t - begun, 1), len(set(question.symbols.tolist()))))
     if posterior is not None:
         inquiry.learn(posterior)
@@ -286,15 +290,23 @@ def store(seed, config, number=1000, stops=100, step=0.75, given=0, back=0, **sy
         candidates = memory.candidates(pose, travelled, names)
         if stop < given:
             sightings = [Sighting(names[c], ids[k], u, v) for k, (c, u, v) in zip(shown, places, strict=True)]
-            memory.record(pose, travelled, sightings, np.isin(np.arange(number), shown))
+            memory.record(pose, travelled, sightings, np.isin(np.arange(number), shown), number)
             continue
 
         def prior(where, candidates=candidates):
             return memory.prior(candidates, [names[int(k)] for k in where[:, 0]], where[:, 1:])
 
-        outcome, t = observe(shown, config, made, delays, rng, t, candidates=candidates, places=places, prior=prior)
+        def align(where, posterior):
+            named = np.flatnonzero(posterior.decided(config.min_probability))
+            cameras = [names[int(where[k, 0])] for k in named]
+            return memory.align(cameras, where[named, 1:], posterior.label[named])
+
+        outcome, t = observe(
+            shown, config, made, delays, rng, t, candidates=candidates, places=places, prior=prior, align=align
+        )
         sightings = [Sighting(names[int(c)], ids[label], u, v) for label, (c, u, v) in outcome.named.items()]
-        memory.record(pose, travelled, sightings, outcome.inquiry.asked)
+        audited = len(outcome.inquiry.audited)
+        memory.record(pose, travelled, sightings, outcome.inquiry.asked, audited)
         survey.right += outcome.right
         survey.wrong += outcome.wrong
         survey.undecided += outcome.undecided

@@ -289,17 +289,29 @@ def test_a_twentieth_of_the_known_labels_is_asked_twice_as_an_audit():
     expected = np.ones(60, bool)
     everybody = [(np.array([label]), np.array([0.9999])) for label in range(60)]
     known = Posterior(np.arange(60), np.full(60, 0.9999), np.zeros(60), everybody)
-    audited = []
+    audited, owed = [], 0.0
     for seed in range(80):
-        inquiry = inquire(60, seed=seed, expected=expected)
+        inquiry = inquire(60, seed=seed, expected=expected, owed=owed)
         inquiry.next_question(None, 0.0)
-        audit = inquiry.audit
-        audited.append(len(audit))
         answer(inquiry, 0.0, lights=60)
         again = inquiry.next_question(known, 20.0)
-        assert sorted([] if again is None else again.labels) == audit.tolist()
-    assert 0.03 <= np.mean(audited) / 60 <= 0.07
-    assert np.mean(np.array(audited) > 0) < 0.5  # most stops need no slot for it
+        assert sorted([] if again is None else again.labels) == inquiry.audited.tolist()
+        audited.append(len(inquiry.audited))
+        owed += 0.05 * 60 - audited[-1]
+    assert 0.04 <= np.mean(audited) / 60 <= 0.06
+    assert np.mean(np.array(audited) > 0) < 0.2  # most stops need no slot for it
+
+
+def test_an_audit_goes_with_a_slot_that_is_needed_anyway():
+    everybody = [(np.array([label]), np.array([0.9999])) for label in range(58)]
+    lists = [*everybody, *[(np.array([58, 59]), np.array([0.5, 0.5]))] * 3]
+    sure = np.array([0.9999] * 58 + [0.5] * 3)
+    inquiry = inquire(60, expected=np.ones(60, bool), owed=4.0)
+    inquiry.next_question(None, 0.0)
+    answer(inquiry, 0.0, lights=61)
+    again = inquiry.next_question(Posterior(np.array([*range(58), 58, 58, 58]), sure, np.zeros(61), lists), 20.0)
+    assert len(inquiry.audited) == 7  # what was owed, and a twentieth of these
+    assert set(again.labels) >= {58, 59, *inquiry.audited.tolist()}
 
 
 def test_a_stop_too_short_for_names_asks_a_few_labels_all_the_same():

@@ -143,7 +143,6 @@ class Identifier:
             self._candidates = memory.candidates(self._pose, travelled, cameras)
         self._cameras = {name: _Camera(config) for name in cameras}
         self._inquiry = Inquiry(self._candidates, config, delays or DelayModel(config), seed=round(1000.0 * travelled))
-        self._audited = np.zeros(0, np.intp)
         self._lights: list[tuple[str, int]] = []  # camera and number of the track, in the order of their discovery
         self._posterior: Posterior | None = None
         self._waiting: Slot | None = None
@@ -162,8 +161,6 @@ class Identifier:
         question = self._inquiry.next_question(self._posterior, t)
         if question is None:
             return None
-        if not self._number:
-            self._audited = self._inquiry.audit
         asked = requests(question, self.labels, self.config, self._inquiry.delays)
         self._waiting = Slot(self._number, asked, self._inquiry.longest)
         self._number += 1
@@ -223,7 +220,8 @@ class Identifier:
         if self._memory is not None:
             for label in doubted:
                 self._memory.forget(label)
-            self._memory.record(self._pose, self._travelled, sightings, self._inquiry.asked)
+            audited = len(self._inquiry.audited)
+            self._memory.record(self._pose, self._travelled, sightings, self._inquiry.asked, audited)
         return tuple(sightings)
 
     # ---- what the cameras saw ----------------------------------------------------------------------------------------
@@ -254,12 +252,16 @@ class Identifier:
         scores = np.array([runs[name].score[track] for name, track in self._lights]).reshape(-1, len(periods))
         starts = np.array([runs[name].start[track] for name, track in self._lights]).reshape(-1, len(periods))
         self._inquiry.answer(scores, starts - begun, t)
-        self._posterior = self._inquiry.posterior(self._prior(), len(self._lights))
-
-    def _prior(self) -> Prior:
         if self._memory is None:
-            return Prior(self._candidates.weights)
-        return self._memory.prior(self._candidates, [name for name, _ in self._lights], self._places())
+            self._posterior = self._inquiry.posterior(Prior(self._candidates.weights), len(self._lights))
+            return
+        cameras, places = [name for name, _ in self._lights], self._places()
+        for _ in range(2):  # the lights that get names tell where exactly the others must be
+            prior = self._memory.prior(self._candidates, cameras, places)
+            self._posterior = posterior = self._inquiry.posterior(prior, len(self._lights))
+            named = np.flatnonzero(posterior.decided(self.config.min_probability))
+            if not self._memory.align([cameras[light] for light in named], places[named], posterior.label[named]):
+                break
 
     def _places(self) -> Floats:
         """Pixels (N, 2) of the lights."""
@@ -270,9 +272,9 @@ class Identifier:
 
     def _doubted(self, posterior: Posterior) -> set[str]:
         """Audited labels whose light flashes like another label's when its place does not count."""
-        if self._memory is None or not len(self._audited):
+        if self._memory is None or not len(self._inquiry.audited):
             return set()
         blind = self._inquiry.posterior(Prior(self._candidates.weights), len(self._lights))
-        named = posterior.decided(self.config.min_probability) & np.isin(posterior.label, self._audited)
+        named = posterior.decided(self.config.min_probability) & np.isin(posterior.label, self._inquiry.audited)
         other = named & (blind.label != posterior.label) & (blind.probability >= 0.9) & (blind.none < 0.05)
         return {self.labels[label] for label in posterior.label[other]}

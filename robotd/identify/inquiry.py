@@ -31,7 +31,8 @@ SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput 
 SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
 SINGLES = 3  # slots for each label when they are asked one at a time
-AUDITS = 0.25  # of the stops; the others need no slot for it
+ENOUGH_OWED = 0.4  # of the known labels: when the audit owes so many, it gets a slot of its own
+STILL_THERE = 0.1  # probability from which a label that did not answer is asked again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +42,8 @@ class Candidates:
     `weights` lights that each is expected to make here. `expected` those that must be in view because their places are
     known. `wanted` false: nobody would learn anything from its flash. `asked` how often it was asked at other stops:
     when there is no time for all, the ones least asked come first. `rivals` per expected label the labels whose
-    predicted image positions are near enough to be confused with it, itself among them.
+    predicted image positions are near enough to be confused with it, itself among them. `owed` labels that the audit
+    should have asked at earlier stops.
     """
 
     weights: Floats
@@ -49,6 +51,7 @@ class Candidates:
     wanted: Flags
     asked: Numbers
     rivals: dict[int, Numbers] = field(default_factory=dict)
+    owed: float = 0.0
 
     @classmethod
     def anything(cls, labels: int) -> Candidates:
@@ -80,7 +83,7 @@ class Inquiry:
         self.delays = delays
         self.pace = Pace(delays)
         self.evidence: list[Evidence] = []
-        self.audit: Numbers = np.zeros(0, np.intp)
+        self.audited: Numbers = np.zeros(0, np.intp)  # labels known by their place that were asked again as a check
         self.asked: Flags = np.zeros(len(candidates.weights), bool)  # at this stop
         self._rng = np.random.default_rng(seed)
         self._question: Question | None = None
@@ -159,8 +162,6 @@ class Inquiry:
         """Everything that may be visible, as far as time allows; what is known to be in view goes first."""
         candidates, config = self.candidates, self.config
         known = self._rng.permutation(np.flatnonzero(candidates.wanted & candidates.expected))
-        audited = config.audit_fraction / AUDITS * len(known) if self._rng.random() < AUDITS else 0.0
-        self.audit = np.sort(known[: round(audited)])
         others = self._rng.permutation(np.flatnonzero(self._worth_asking() & ~candidates.expected))
         others = others[np.argsort(candidates.asked[others], kind="stable")]
         most = self.pace.affordable(len(known), candidates.weights[others], config.stop_s)
@@ -172,8 +173,9 @@ class Inquiry:
         groups = [candidates.rivals.get(int(label), label[None]) for label in known]
         lists = [(group, np.full(len(group), 1.0 / len(group))) for group in groups]
         rivals = float(np.quantile([len(group) - 1.0 for group in groups], 0.9)) if groups else 0.0
-        doubt = float(len(others)) if candidates.weights[others].sum() >= 1.0 else 0.0
-        return self._compose(known, others, lists, max(doubt, rivals))
+        new = float(candidates.weights[others].sum())  # lights of which nothing is known
+        many = new > 0.1 * (new + float(candidates.weights[known].sum()))
+        return self._compose(known, others, lists, max(float(len(others)) if many else 0.0, rivals))
 
     def _repeat(self, posterior: Posterior, t: float) -> Question | None:
         """Every candidate of every light that is undecided, known labels that did not answer, and the audit."""
@@ -184,10 +186,13 @@ class Inquiry:
         )
         named = np.flatnonzero(posterior.decided(config.min_probability) & (posterior.none < 0.5))
         worth = len(undecided) >= max(1.0, config.repeat_fraction * (len(named) + len(undecided)))
-        silent = np.zeros(0, np.intp)
+        audit = silent = np.zeros(0, np.intp)
         if len(self.evidence) == 1:
-            silent = np.setdiff1d(np.flatnonzero(candidates.expected & self.asked), posterior.label[named])
-        audit, self.audit = (self.audit, np.zeros(0, np.intp)) if len(self.evidence) == 1 else (silent[:0], self.audit)
+            known = np.flatnonzero(candidates.expected & self.asked)
+            owed = candidates.owed + config.audit_fraction * len(known)
+            if worth or owed >= ENOUGH_OWED * len(known) > 0.0:
+                self.audited = audit = np.sort(self._rng.permutation(known)[: int(owed)])
+            silent = self._still_there(np.setdiff1d(known, posterior.label[named]))
         left = (self._started + config.stop_s - t - self.pace.overhead) / self.delays.interval
         if not worth and not len(audit):
             return None
@@ -204,6 +209,12 @@ class Inquiry:
             return None
         doubt = (1.0 - posterior.probability[undecided]) / np.maximum(posterior.probability[undecided], 1e-9)
         return self._compose(ask, ask[:0], lists, float(np.median(doubt)) if len(doubt) else 0.0)
+
+    def _still_there(self, silent: Numbers) -> Numbers:
+        """Those of the labels without an answer that are in view rather than hidden, though their flashes were lost."""
+        shows = np.clip(self.candidates.weights[silent], 0.0, 0.95)
+        lost = self.config.lost_fraction * shows
+        return silent[lost >= STILL_THERE * (lost + 1.0 - shows)]
 
     def _found(self, lights: int) -> Numbers:
         """The slot (N,), counted from 1, in which each light was found."""

@@ -1,23 +1,26 @@
 """What the robot itself knows of where labels are, so that at the next stop it knows where their lights must appear.
 
-The map is made off the robot. Here, rays to the labels seen at earlier stops are intersected in odometry axes, by least
-squares in which a ray counts less the further the robot has driven since, with a broad prior on the depth along the
-newest one. From a single stop that leaves a label on a stretch of its ray; so a predicted image position is a mixture
-of a few points along the least known direction of the label's covariance.
+The map is made off the robot. Here, rays to the labels seen at earlier stops are intersected by least squares in which
+a ray counts less the less is known of the robot's heading since, with a broad prior on the depth along the newest one.
+From a single stop that leaves a label on a stretch of its ray; so a predicted image position is a mixture of a few
+points along the least known direction of the label's covariance. Once some lights of a stop have names, they tell where
+the robot stands (`alignment`): the others are looked for more sharply, and the axes are odometry's less its drift.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.camera import Camera
-from ..geometry.transforms import invert_rigid, pose_matrix, transform_points
+from ..geometry.transforms import invert_rigid, pose_array, pose_matrix, se2_compose, se2_inverse, transform_points
 from ..records import CameraModel, Floats, Pose, Sighting
+from .alignment import align
 from .decoder import Numbers, Prior
 from .inquiry import FIRST_LIGHTS, Candidates
 from .settings import IdentifyConfig
@@ -55,6 +58,18 @@ class _Prediction:
     sigmas: Floats  # (C, M, P)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stand:
+    """Where the robot stands: its `pose` in odometry axes, metres `travelled`, and the corrected T_memory_robot (4, 4).
+    `doubt` is the heading's variance, added up over the leg, `spread` the size of prediction errors as measured."""
+
+    pose: Pose
+    travelled: float
+    T_memory_robot: Floats
+    doubt: float
+    spread: float = 1.0
+
+
 class LabelMemory:
     """Rays to labels in odometry axes, and what was asked at earlier stops; lives as long as the mission's leg.
 
@@ -81,20 +96,25 @@ class LabelMemory:
         self.refused: set[str] = set()  # labels that the label system does not take
         self._cameras = [Camera(camera) for camera in cameras]
         self._height = float(np.mean([camera.T_robot_camera[2, 3] for camera in self._cameras] or [0.0]))
+        self._focal = max((float(camera.focal[0]) for camera in self._cameras), default=0.0)
         self._number = {camera.name: number for number, camera in enumerate(cameras)}
         self._zones = [
             (np.array([self.index[label] for label in names if label in self.index], np.intp), begin, end)
             for names, begin, end in zones
         ]
         self._missed = np.zeros(len(labels), np.intp)
+        self.owed = 0.0  # labels that the audit has not asked yet
         self._distances: list[float] = []
         self._prediction: _Prediction | None = None
+        self._looking: Sequence[str] = ()  # cameras of the present stop
         self._expected = np.zeros(len(labels), bool)
         self.forget_places()
 
     def forget_places(self) -> None:
         """Odometry was interrupted: what was seen before is somewhere else now."""
-        self._rays: dict[int, list[tuple[Floats, Floats, float]]] = {}  # origin, direction, travelled
+        self._rays: dict[int, list[tuple[Floats, Floats, float]]] = {}  # origin, direction, doubt of the heading there
+        self._drift: Floats = np.zeros(3)  # T_memory_odometry
+        self._last = self._stand = _Stand(Pose(0.0, 0.0, 0.0), 0.0, np.eye(4), 0.0)
 
     def forget(self, label: str) -> None:
         """The label was taken for another one."""
@@ -108,6 +128,7 @@ class LabelMemory:
             "missed": {names[k]: int(self._missed[k]) for k in np.flatnonzero(self._missed)},
             "learnt": sorted(self.learnt),
             "refused": sorted(self.refused),
+            "owed": self.owed,
             "distances": [round(distance, 2) for distance in self._distances],
         }
 
@@ -119,6 +140,7 @@ class LabelMemory:
                     counts[self.index[label]] = count
         self.learnt |= self.index.keys() & set(state["learnt"])
         self.refused |= self.index.keys() & set(state["refused"])
+        self.owed = state.get("owed", 0.0)  # not in what an earlier release left
         self._distances = list(state["distances"])
 
     @property
@@ -133,7 +155,9 @@ class LabelMemory:
         unseen[list(self._rays)] = False
         fresh = FIRST_LIGHTS if not self._rays else NEW_LIGHTS
         weights = np.where(unseen, min(0.5, fresh / max(1, int(unseen.sum()))), ELSEWHERE)
-        self._prediction = prediction = self._predict(pose, travelled, cameras)
+        self._looking = cameras
+        self._stand = self._arrived(pose, travelled)
+        self._prediction = prediction = self._predict(self._stand)
         share = prediction.weights.sum(axis=(0, 2))
         weights[prediction.labels] = np.maximum(SHOWS * FORGETS ** self._missed[prediction.labels] * share, ELSEWHERE)
         self._expected = ~unseen & (weights >= EXPECTED * SHOWS)
@@ -146,7 +170,7 @@ class LabelMemory:
                 wanted[labels] = False
                 weights[labels] = 0.0
         wanted[[self.index[label] for label in self.learnt | self.refused]] = False
-        return Candidates(weights, self._expected & wanted, wanted, self.asked.copy(), self._rivals())
+        return Candidates(weights, self._expected & wanted, wanted, self.asked.copy(), self._rivals(), self.owed)
 
     def prior(self, candidates: Candidates, cameras: Sequence[str], pixels: Floats) -> Prior:
         """What the positions (N, 2) of lights in those cameras say about which labels they are."""
@@ -164,17 +188,56 @@ class LabelMemory:
             ratios[light] = (1.0 - MISPREDICTED) * density / inside * area.sum() + MISPREDICTED
         return Prior(candidates.weights, prediction.labels, np.log(ratios))
 
-    def record(self, pose: Pose, travelled: float, sightings: Sequence[Sighting], asked: NDArray[np.bool_]) -> None:
-        """Take in the sightings of a stop, and which labels (L,) were asked to flash there."""
-        T_world_robot = pose_matrix(pose.x, pose.y, pose.heading)
+    def align(self, cameras: Sequence[str], pixels: Floats, labels: Numbers) -> bool:
+        """Correct the present stop's pose by lights at positions (N, 2) in those cameras that are known to be `labels`.
+
+        Returns
+        -------
+        bool
+            Whether the predictions that `prior` goes by have changed.
+        """
+        names, points, covariances, _, _ = self._points()
+        row = {int(label): k for k, label in enumerate(names)}
+        here = np.array([k for k, label in enumerate(labels) if int(label) in row], np.intp)
+        rows = np.array([row[int(labels[k])] for k in here], np.intp)
+        start = self._arrived(self._stand.pose, self._stand.travelled)
+        found = align(
+            self._cameras,
+            np.array([self._number[cameras[k]] for k in here], np.intp),
+            pixels[here],
+            points[rows],
+            covariances[rows],
+            start.T_memory_robot,
+            math.sqrt(start.doubt - self._last.doubt + RAY_NOISE**2),
+            math.hypot(self.config.prediction_px, RAY_NOISE * self._focal),
+        )
+        if found is None:
+            return False
+        doubt = self._last.doubt + found.heading**2
+        self._stand = replace(start, T_memory_robot=found.T_world_robot, doubt=doubt, spread=found.spread)
+        self._prediction = self._predict(self._stand)
+        return True
+
+    def record(
+        self, pose: Pose, travelled: float, sightings: Sequence[Sighting], asked: NDArray[np.bool_], audited: int = 0
+    ) -> None:
+        """Take in the sightings of a stop, which labels (L,) were asked to flash there, and how many were audited."""
+        if self._stand.pose != pose:
+            self._stand = self._arrived(pose, travelled)
+        named = [sighting for sighting in sightings if sighting.label in self.index]
+        pixels = np.array([(sighting.u, sighting.v) for sighting in named]).reshape(-1, 2)
+        labels = np.array([self.index[sighting.label] for sighting in named], np.intp)
+        self.align([sighting.camera for sighting in named], pixels, labels)
+        self._last = stand = replace(self._stand, travelled=travelled)
+        x, y, heading = *stand.T_memory_robot[:2, 3], np.arctan2(*stand.T_memory_robot[1::-1, 0])
+        self._drift = se2_compose((x, y, heading), se2_inverse(pose_array(pose)))
         seen: dict[int, list[tuple[Floats, Floats, float]]] = {}
-        for sighting in sightings:
-            camera = self._cameras[self._number[sighting.camera]]
-            rays, valid = camera.rays(np.array([[sighting.u, sighting.v]]))
-            if valid[0] and sighting.label in self.index:
-                T = T_world_robot @ camera.T_robot_camera
-                ray = (T[:3, 3], T[:3, :3] @ rays[0], travelled)
-                seen.setdefault(self.index[sighting.label], []).append(ray)
+        for camera in self._cameras:
+            here = np.array([sighting.camera == camera.name for sighting in named], bool)
+            rays, valid = camera.rays(pixels[here])
+            T = stand.T_memory_robot @ camera.T_robot_camera
+            for label, along in zip(labels[here][valid], rays[valid] @ T[:3, :3].T, strict=True):
+                seen.setdefault(int(label), []).append((T[:3, 3], along, stand.doubt))
         self._distances = (self._distances + self._measured(seen))[-500:]
         for label, rays_ in seen.items():
             self._rays[label] = (self._rays.get(label, []) + rays_)[-RAYS_KEPT:]
@@ -183,6 +246,8 @@ class LabelMemory:
         answered[list(seen)] = True
         self._missed[asked & self._expected & ~answered] += 1
         self._missed[answered] = 0
+        known = float(np.count_nonzero(asked & self._expected))
+        self.owed = float(np.clip(self.owed + self.config.audit_fraction * known - audited, 0.0, known))
 
     def _measured(self, seen: Mapping[int, list[tuple[Floats, Floats, float]]]) -> list[float]:
         """Distances of the labels that have just been seen and were predicted."""
@@ -197,16 +262,24 @@ class LabelMemory:
 
     # ---- geometry ----------------------------------------------------------------------------------------------------
 
-    def _points(self, travelled: float) -> tuple[Numbers, Floats, Floats, Floats, Floats]:
-        """Seen labels (M,), positions (M, 3) with covariances (M, 3, 3), metres driven since, directions seen from."""
+    def _arrived(self, pose: Pose, travelled: float) -> _Stand:
+        """Where the robot stands by odometry since the latest stop."""
+        x, y, heading = se2_compose(self._drift, pose_array(pose))
+        driven = abs(travelled - self._last.travelled)
+        doubt = self._last.doubt + HEADING_NOISE**2 * driven
+        return _Stand(pose, travelled, pose_matrix(x, y, heading), doubt)
+
+    def _points(self) -> tuple[Numbers, Floats, Floats, Floats, Floats]:
+        """Seen labels (M,), positions (M, 3) with covariances (M, 3, 3), doubt of the heading when they were seen last,
+        directions seen from (M, 3)."""
         labels = np.array(list(self._rays), np.intp)
         owner = np.repeat(np.arange(len(labels)), [len(rays) for rays in self._rays.values()])
         rays = [ray for each in self._rays.values() for ray in each]
         origin = np.array([ray[0] for ray in rays]).reshape(-1, 3)
         along = np.array([ray[1] for ray in rays]).reshape(-1, 3)
-        since = np.maximum(travelled - np.array([ray[2] for ray in rays]), 0.0)
+        doubt = np.array([ray[2] for ray in rays])
         newest = np.cumsum([len(each) for each in self._rays.values()]) - 1 if len(labels) else np.zeros(0, np.intp)
-        noise = np.hypot(RAY_NOISE, HEADING_NOISE * np.sqrt(since))
+        noise = np.sqrt(RAY_NOISE**2 + np.maximum(self._last.doubt - doubt, 0.0))
         across = np.eye(3) - along[:, :, None] * along[:, None, :]
         start: Floats = origin[newest] + DEPTH_M * along[newest]
         points: Floats = start.copy()
@@ -225,37 +298,38 @@ class LabelMemory:
         facing = np.zeros((len(labels), 3))
         np.add.at(facing, owner, -along)
         facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
-        return labels, points, np.asarray(np.linalg.inv(information)), np.asarray(since[newest]), facing
+        return labels, points, np.asarray(np.linalg.inv(information)), np.asarray(doubt[newest]), facing
 
-    def _predict(self, pose: Pose, travelled: float, names: Sequence[str]) -> _Prediction:
-        labels, points, covariances, since, facing = self._points(travelled)
-        near = np.hypot(points[:, 0] - pose.x, points[:, 1] - pose.y) < FARTHEST_M
+    def _predict(self, stand: _Stand) -> _Prediction:
+        labels, points, covariances, doubt, facing = self._points()
+        x, y = stand.T_memory_robot[:2, 3]
+        near = np.hypot(points[:, 0] - x, points[:, 1] - y) < FARTHEST_M
         labels, points, covariances = labels[near], points[near], covariances[near]
-        since, facing = since[near], facing[near]
+        heading, facing = np.sqrt(RAY_NOISE**2 + np.maximum(stand.doubt - doubt[near], 0.0)), facing[near]
         variances, axes = np.linalg.eigh(covariances)
         long = np.sqrt(variances[:, -1])[:, None, None] * axes[:, None, :, -1]
         spread = points[:, None, :] + POINTS[None, :, None] * long  # (M, P, 3)
-        away = np.array([pose.x, pose.y, self._height]) - spread
+        away = np.array([x, y, self._height]) - spread
         distances = np.linalg.norm(away, axis=2)
         reach = REACH * float(np.quantile(self._distances, 0.95)) if len(self._distances) >= 20 else FARTHEST_M
         shows = (distances <= reach) & ((facing[:, None, :] * away).sum(axis=2) >= NARROW * distances)
         shares = np.where(shows, 1.0, RARELY) * POINT_WEIGHTS
         sure = np.sqrt(variances[:, -1]) < 0.2 * distances.mean(axis=1)
-        T_robot_world = invert_rigid(pose_matrix(pose.x, pose.y, pose.heading))
+        T_robot_world = invert_rigid(stand.T_memory_robot)
         shape = (len(self._cameras), len(labels), len(POINTS))
         pixels, weights, sigmas = np.full((*shape, 2), -1e6), np.zeros(shape), np.ones(shape)
         for number, camera in enumerate(self._cameras):
-            if camera.name not in names:
+            if camera.name not in self._looking:
                 continue
             there = transform_points(invert_rigid(camera.T_robot_camera) @ T_robot_world, spread.reshape(-1, 3))
             uv, valid = camera.project(there)
             valid &= camera.in_image(np.where(valid[:, None], uv, -1e6), margin=2.0)
             uv = np.where(valid[:, None], uv, -1e6).reshape(*shape[1:], 2)
             step = np.linalg.norm(np.gradient(uv, axis=1), axis=2)
-            heading = camera.focal[0] * np.hypot(RAY_NOISE, HEADING_NOISE * np.sqrt(since))[:, None]
+            noise = stand.spread**2 * (self.config.prediction_px**2 + (camera.focal[0] * heading[:, None]) ** 2)
             pixels[number] = uv
             weights[number] = valid.reshape(shape[1:]) * shares
-            sigmas[number] = np.sqrt(self.config.prediction_px**2 + heading**2 + np.minimum(0.5 * step, 60.0) ** 2)
+            sigmas[number] = np.sqrt(noise + np.minimum(0.5 * step, 60.0) ** 2)
         return _Prediction(labels, distances.mean(axis=1), sure, pixels, weights, sigmas)
 
     def _rivals(self) -> dict[int, Numbers]:
