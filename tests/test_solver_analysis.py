@@ -80,9 +80,8 @@ def test_a_free_scale_is_named():
     survey, _ = quiet_room()
     still = tuple(replace(s, leg=s.stop, stop=1, move=None) for s in survey.stops)
     assert any("nothing shows the size" in text for text in observability(replace(survey, stops=still)))
-    noisy, _ = noisy_room()
-    coarse = with_sightings(noisy, lambda stop: [replace(s, sigma_px=2.0) for s in stop.sightings])
-    _, analysis = analyse(replace(coarse, priors=replace(noisy.priors, odometry_scale=0.2)))
+    coarse, _ = simulate(load("room"), 2, World(reflections=0.0, reach=2.5, centroid_px=2.0))
+    _, analysis = analyse(replace(coarse, priors=replace(coarse.priors, odometry_scale=0.2)))
     assert analysis.scale > 0.015
     assert any("size of the map is known to" in text for text in analysis.after)
 

@@ -28,6 +28,7 @@ _MOST_COLUMNS = 6000  # of a dense inverse: 300 MB
 _OUTSIDE_M = 0.5
 _FREE_SCALE = 0.01  # relative standard deviation from which the size of the map counts as free
 _DOUBT = 1e-3  # probability of a larger chi-square by chance
+_CAMERA = "camera "  # how the name of a camera's sightings begins
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +135,10 @@ def analyse(survey: Survey) -> tuple[Map, Analysis]:
     frame = _frame_covariance(adjustment, state)
     sensors = _sensors(optimum, frame)
     scale, heading = _shape(optimum, frame)
-    chi_square, redundancy = sum(s.chi_square for s in sensors), sum(s.redundancy for s in sensors)
+    # stated sigmas of sightings were replaced by estimates where residuals contradict them: only the rest is a test
+    others = sum(s.chi_square for s in sensors if not s.sensor.startswith(_CAMERA))
+    chi_square = others + float((adjustment.residuals(state, SQUARE).residual ** 2).sum())
+    redundancy = sum(s.redundancy for s in sensors)
     probability = float(scipy.special.gammaincc(0.5 * redundancy, 0.5 * chi_square)) if redundancy > 1.0 else 1.0
     after = [*_after(optimum, result, scale), *_doubts(sensors)]
     if probability < _DOUBT:
@@ -275,17 +279,17 @@ def _frame_covariance(adjustment: Adjustment, state: State) -> Floats | None:
 def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:
     """Standard deviations of every kind of measurement, from its residuals and what fitting left of them."""
     problem, state, adjustment = optimum.problem, optimum.state, optimum.adjustment
-    residuals = adjustment.residuals(state, SQUARE)
-    square = (residuals.residual**2).sum(axis=1)
-    spare = 2.0 - optimum.covariance.leverage
     used = adjustment.sightings
+    said = problem.columns.sigma[used.source]
+    square = (adjustment.residuals(state, SQUARE).residual ** 2).sum(axis=1) * (used.sigma / said) ** 2
+    spare = 2.0 - optimum.covariance.leverage
     result = []
     for c, camera in enumerate(problem.cameras):
         mine = used.camera == c
         if mine.any():
-            stated = float(np.sqrt(np.mean(used.sigma[mine] ** 2)))
+            stated = float(np.sqrt(np.mean(said[mine] ** 2)))
             result.append(
-                Scatter(f"camera {camera.name}", stated, "px", float(square[mine].sum()), float(spare[mine].sum()))
+                Scatter(f"{_CAMERA}{camera.name}", stated, "px", float(square[mine].sum()), float(spare[mine].sum()))
             )
     if frame is None:
         return tuple(result)

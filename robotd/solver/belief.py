@@ -93,7 +93,9 @@ class Belief:
     def __init__(self, optimum: Optimum, depth: float, depth_sigma: float, guesses: Floats, guess_sigma: float) -> None:
         problem, state = optimum.problem, optimum.state
         single = _only_rays(optimum)
-        sightings = problem.sightings.select(np.flatnonzero(optimum.inlier | single))
+        sigma = problem.sightings.sigma.copy()
+        sigma[optimum.inlier] = optimum.adjustment.sightings.sigma
+        sightings = replace(problem.sightings, sigma=sigma).select(np.flatnonzero(optimum.inlier | single))
         sightings = replace(sightings, probability=np.ones(len(sightings)))  # as in the optimum's own adjustment
         rays = problem.sightings.select(single)
         points = state.points.copy()

@@ -21,7 +21,8 @@ from .bundle import SQUARE, Adjustment, Loss
 from .mapping import to_map
 from .placement import Placement, retriangulate
 from .problem import STOP, Bools, Ints, Motions, Moves, Problem, Roofs, Sightings, State, build_problem
-from .robust import OUTLIER, Optimum, optimise, ray_tolerance
+from .robust import Optimum, optimise, ray_tolerance
+from .weights import OUTLIER
 
 Arrays = TypeVar("Arrays", Moves, Motions, Roofs)
 

@@ -30,7 +30,8 @@ from .bundle import SQUARE, Adjustment
 from .initial import world_rays
 from .linear import solve_linear
 from .problem import Bools, Problem, Sightings, build_problem, stops_per_label
-from .robust import OUTLIER, Optimum, optimise
+from .robust import Optimum, optimise
+from .weights import OUTLIER
 
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
 _TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
@@ -90,7 +91,6 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
     problem, state = optimum.problem, optimum.state
     everything = Adjustment(problem, problem.sightings)
     linear = everything.residuals(state, SQUARE)
-    square = (linear.residual**2).sum(axis=1)
     counts = Counter(problem.columns.names)
     tally = _tally(asked, optimum)
     share = _share(optimum)
@@ -110,7 +110,8 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
         notes.append(_misfit(asked, share))
     if len(problem.sightings) == 0:
         notes.append("the survey has no usable sightings, so no label has a position")
-    cost = 0.5 * (square[inlier].sum() + (linear.move**2).sum() + (linear.roof**2).sum())
+    fit = optimum.adjustment.residuals(state, SQUARE)
+    cost = 0.5 * ((fit.residual**2).sum() + (fit.move**2).sum() + (fit.roof**2).sum())
     return Map(
         survey=problem.survey.survey,
         frame=problem.frame,

@@ -28,7 +28,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 STOP, CAMERA, ODOMETRY = 5, 10, 2  # entries of the frame vector per stop, per camera, and for all odometry
-SIGMA_FLOOR_PX = 0.05  # because no lens calibration is better than this, whatever a detector says of its centroid
+SIGMA_FLOOR_PX = 0.05  # to judge which sightings fit: what lenses leave, whatever a detector says of its centroid
 BEACON_SPREAD_M = 0.05  # beacons nearer together than this do not show a heading
 COVARIANCE_FLOOR = np.diag([1e-4, 1e-4, 1e-4]) ** 2  # keeps a move that was reported as exact invertible
 

@@ -19,8 +19,8 @@ from .covariance import Covariance, covariance
 from .initial import epipolar_moves, triangulate, world_rays
 from .placement import Placement, at_first_stop, detach, place, retriangulate
 from .problem import Bools, Ints, Known, Problem, State, anchors, stops_per_label
+from .weights import OUTLIER, weighed
 
-OUTLIER = 20.0  # squared whitened residual, 2 degrees of freedom: one right sighting in 20 000 exceeds it
 _SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
 SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # what a slipped move still says: one wheel spun for some centimetres
 _WRONG_KNOWN = 25.0
@@ -206,6 +206,7 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         if factor == 1.0:
             break
         problem = _rescaled(problem, factor)
+    adjustment, state, sure = weighed(adjustment, state, sure, problem.columns.sigma[problem.sightings.source[inlier]])
     kept = state
     state, reflected, (gain, rival_points, rival_gain) = _out_of_glass(problem, state)
     if state is not kept:  # a label that only now seems to be its image stays where it was adjusted
