@@ -267,6 +267,13 @@ def show_schema() -> int:
 
 def check(path: Path) -> int:
     """Name every mistake of a configuration, a calibration or a layout; raises InputError with them."""
+    from .startup import kept
+
+    with kept():
+        return _check(path)
+
+
+def _check(path: Path) -> int:
     from .config import load_calibration, read_toml
 
     data = read_toml(path)
@@ -280,6 +287,7 @@ def check(path: Path) -> int:
         load_calibration(path)
         print(f"{path}: a calibration without mistakes")
         return 0
+    from . import operations, prompt  # noqa: F401  because the code that they generate is left for `run`, too
     from .daemon import assemble, read_config
     from .real import RealHardware
 
@@ -296,7 +304,7 @@ def check(path: Path) -> int:
 def run(path: Path, *, mission: bool) -> int:
     """Run the daemon until SIGTERM or SIGINT, or until its mission has ended."""
     from .notify import notify
-    from .service import keep_memory_together, loading, log_handler
+    from .startup import keep_memory_together, loading
 
     keep_memory_together()
     with loading():
@@ -305,6 +313,7 @@ def run(path: Path, *, mission: bool) -> int:
         from .operations import Operations
         from .prompt import converse
         from .real import RealHardware
+        from .service import log_handler
 
         logging.basicConfig(level=logging.INFO, handlers=[log_handler()])
         hardware = RealHardware()

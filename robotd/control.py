@@ -86,7 +86,7 @@ class ControlLoop:
         with self.bus.commands.subscribe() as wishes:
             async for wish in wishes:
                 self.gate.command(wish)
-                was_resting, self._wished = self._is_resting, now()
+                was_resting, self._wished = self.is_resting, now()
                 if was_resting:  # because the next sensor frame may be a tenth of a second away
                     self._steer()
 
@@ -104,10 +104,11 @@ class ControlLoop:
             await asyncio.sleep(max(0.0, start + tick * WATCH_S - now()))
             if now() - self._last >= WATCH_S:
                 self._steer()
-            tick += REST_TICKS if self._is_resting and self.gate.limits.loop_s > 1.5 * REST_TICKS * WATCH_S else 1
+            tick += REST_TICKS if self.is_resting and self.gate.limits.loop_s > 1.5 * REST_TICKS * WATCH_S else 1
 
     @property
-    def _is_resting(self) -> bool:
+    def is_resting(self) -> bool:
+        """Whether it stands, and nobody has wished to move it for a while."""
         return not self._is_moving and now() - self._wished > REST_AFTER_S
 
     def _steer(self) -> None:

@@ -8,6 +8,7 @@ safe motion, and runs at most one mission.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections import Counter
 from collections.abc import Coroutine, Mapping
@@ -44,6 +45,7 @@ from .web import WebServer
 log = logging.getLogger("robotd")
 
 TRAIL_S = 0.1
+WRITE_S = 1.0  # of the trail, and of where the mission is
 CLOCK_S, STEP_S = 10.0, 1.0  # between two looks at the date; a change by more than so much is a step
 LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
@@ -465,15 +467,23 @@ class Daemon:
                 await self._note_clock()
 
     async def _keep_trail(self, journal: Journal) -> None:
+        """Ten points a second of the way that it rolls; at rest one look, because waking up costs a Pi's core."""
         rows: list[tuple[float, float, float, float]] = []
-        last = None
-        async for tick in ticks(TRAIL_S):
-            state = self.assembly.bus.odometry.latest
-            if state is not None and state is not last and (last is None or state.pose != last.pose):
-                rows.append((state.t, state.pose.x, state.pose.y, state.pose.heading))
-                last = state
-            if tick % 10 == 0:
-                note = self.missions.note()
-                if rows or note is not None:
-                    await in_thread(journal.add_trail, rows, note)
-                    rows = []
+        last, written = None, now()
+        with self.assembly.bus.commands.subscribe(size=1) as wishes:
+            while True:
+                state, moved = self.assembly.bus.odometry.latest, False
+                if state is not None and (last is None or state.pose != last.pose):
+                    rows.append((state.t, state.pose.x, state.pose.y, state.pose.heading))
+                    last, moved = state, True
+                if now() - written >= WRITE_S:
+                    note, written = self.missions.note(), now()
+                    if rows or note is not None:
+                        await in_thread(journal.add_trail, rows, note)
+                        rows = []
+                if moved or not self.control.is_resting:
+                    await asyncio.sleep(TRAIL_S)
+                    continue
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(WRITE_S):
+                        await wishes.get()

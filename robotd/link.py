@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 QUEUE_LIMIT = 4096  # bytes: more than that waiting means that the device takes none
 CLOSE_WAIT = 0.05  # s for what is still queued when the line is closed
 ANSWER_S = 5.0  # for the guardian to lend the port; it may be halting the robot of the loan before
+REST_BEAT_S = 2 * BEAT_S  # while a robot at rest is listened to in bunches: each wake-up counts then
 ECHO_S = 1.0  # without an answer to a heartbeat for so long the guardian counts as gone
 HALTS = 3  # because a byte may be lost
 
@@ -226,9 +227,13 @@ class LentLink:
             self._rest = None
         if seconds > 0.0:
             self._loop.remove_reader(self._fd)
-            self._rest = self._loop.call_later(seconds, self.rest, 0.0)
+            self._rest = self._loop.call_later(seconds, self._end_rest)
         else:
             self._loop.add_reader(self._fd, self._on_readable)
+
+    def _end_rest(self) -> None:
+        self.rest(0.0)
+        self._on_readable()
 
     def close(self) -> None:
         """Send what is queued, then give the port back; safe to call twice."""
@@ -318,7 +323,7 @@ class LentLink:
             self._on_guardian()  # its last words may be there
             return
         self._sent = now()
-        self._beat_timer = self._loop.call_later(BEAT_S, self._beat)
+        self._beat_timer = self._loop.call_later(BEAT_S if self._rest is None else REST_BEAT_S, self._beat)
 
     def _is_in_time(self) -> bool:
         """Whether the guardian can still take this process for alive; if not the robot is Off, and nothing is sent."""

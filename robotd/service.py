@@ -1,16 +1,14 @@
-"""robotd as a service: its line in `systemctl status`, its log in the journal with fields, short pauses."""
+"""robotd as a service: its line in `systemctl status`, its log in the journal with fields."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import gc
 import logging
 import os
 import socket
 import struct
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from .clock import ticks
 from .notify import notify
@@ -19,8 +17,6 @@ from .records import MissionStatus
 JOURNAL = "/run/systemd/journal/socket"
 TELL_S = 2.0
 LINE_LIMIT = 300  # characters of the status line
-SWITCH_S = 0.001
-M_ARENA_MAX = -8  # mallopt(3)
 PRIORITIES = {logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6}  # syslog(3)
 
 
@@ -91,28 +87,6 @@ def log_handler() -> logging.Handler:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
     return handler
-
-
-def keep_memory_together() -> None:
-    """Have glibc's malloc use one arena: each thread would keep some MB of its own, which no other could use."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)
-
-
-@contextlib.contextmanager
-def loading() -> Iterator[None]:
-    """Load everything inside: what is there afterwards stays, so the garbage collector never looks at it again.
-
-    A full collection of what is imported takes 10 ms here and ten times that on a Pi, with the control loop standing
-    still. And from then on a thread that wants to run waits 1 ms for one that computes in Python, not 5 ms.
-    """
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
-        sys.setswitchinterval(SWITCH_S)
 
 
 def _field(name: str, value: object) -> bytes:

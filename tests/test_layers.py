@@ -51,7 +51,7 @@ LAYERS = {
         "roof_watch",
         "wheel_runs",
         "recorder",
-        *("supervisor", "service"),
+        *("supervisor", "service", "startup"),
         "control_socket",
         "daemon",
         "config_views",

@@ -303,6 +303,24 @@ def test_heartbeats_leave_every_50_ms_and_stop_with_the_link(pair):
     run_virtual(main())
 
 
+def test_at_rest_heartbeats_leave_every_100_ms(pair):
+    async def main():
+        with lent(pair) as (link, guardian):
+            link.rest(10.0)
+            await asyncio.sleep(0.051)
+            hear(guardian)
+            guardian.send(b"beat")
+            for _ in range(10):
+                await asyncio.sleep(0.1001)
+                assert hear(guardian) == [b"beat"]
+                guardian.send(b"beat")
+            link.rest(0.0)
+            await asyncio.sleep(0.3)
+            assert len(hear(guardian)) == 5
+
+    run_virtual(main())
+
+
 def test_an_unanswered_heartbeat_for_a_second_halts_the_robot_from_here(pair):
     async def main():
         with lent(pair) as (link, _):

@@ -1,7 +1,9 @@
 """A mission in an operator's hands: paused and resumed at any instant, aborted, driven by hand, lifted, continued."""
 
 import asyncio
+import sqlite3
 
+import numpy as np
 import pytest
 
 from robotd import rpc
@@ -33,6 +35,23 @@ def test_a_mission_is_started_once_and_makes_its_stops(tmp_path):
 
     robot = operated(tmp_path, scenario)
     assert robot.daemon.mission.ended is None
+
+
+def test_the_trail_has_ten_points_a_second_from_the_first_move_after_a_long_rest(tmp_path):
+    async def scenario(robot, client):
+        await asyncio.sleep(60.0)
+        await client.call("mission.start")
+        await robot.until("done")
+
+    operated(tmp_path, scenario)
+    with sqlite3.connect(tmp_path / "state" / "journal.sqlite") as connection:
+        rows = np.array(connection.execute("SELECT t, x FROM trail ORDER BY t").fetchall())
+    connection.close()
+    rows = rows[rows[:, 1] > 0.0]
+    assert rows[0, 1] < 0.05
+    moving = np.diff(rows[:, 1]) > 0.01
+    assert moving.sum() > 80
+    assert np.diff(rows[:, 0])[moving].max() < 0.15
 
 
 @pytest.mark.parametrize("state", ["driving", "settling", "observing"])

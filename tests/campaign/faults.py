@@ -2,7 +2,8 @@
 
     python -m pytest tests/campaign/faults.py -s      500 kills, 20 power cuts: minutes of computing, an hour of waiting
 
-ROBOTD_KILLS sets another number of kills. Power cuts and full disks need root and a loop device.
+ROBOTD_KILLS sets another number of kills, ROBOTD_SEED the first robot's seed. Power cuts and full disks need root and a
+loop device.
 """
 
 import asyncio
@@ -37,6 +38,7 @@ from tests.killed_missions import STOPS, TOLD, Lives, ask, pauses, robot_of
 from tests.line_course import store
 
 KILLS = int(os.environ.get("ROBOTD_KILLS", "500"))
+SEED = int(os.environ.get("ROBOTD_SEED", "0"))
 ROBOTS = 4
 SERVE = """
 import sys
@@ -59,7 +61,7 @@ def solver(folder):
             process.kill()
 
 
-@pytest.mark.parametrize("seed", range(ROBOTS))
+@pytest.mark.parametrize("seed", range(SEED, SEED + ROBOTS))
 def test_a_daemon_may_be_killed_at_any_moment(tmp_path, seed):
     rng, faults = random.Random(seed), random.Random(100 + seed)
     with (
@@ -195,7 +197,7 @@ def disk(path, megabytes):
 
 @needs_root
 def test_a_power_cut_loses_no_stop_that_was_told(tmp_path):
-    rng, cuts = random.Random(7), 0
+    rng, cuts = random.Random(7 + SEED), 0
     image, copy = disk(tmp_path / "a.img", 48), tmp_path / "b.img"
     with mounted(image, tmp_path / "a") as state, BadNetwork(9, lambda: "gone") as network:
         robot = robot_of(tmp_path / "robot", network.url, state=state)

@@ -1,7 +1,7 @@
-"""Both services under systemd, in a container tree: whatever is killed, the robot is halted, and everything comes back.
+"""The services under systemd, in a container tree: whatever is killed, the robot is halted, and everything comes back.
 
 A Debian tree is made with debootstrap and booted with systemd-nspawn; in it run the installed package, the units as
-shipped, and `robotd sim roomba` for a robot. ROBOTD_TREE names a folder in which the tree is kept for the next time.
+shipped, `robotd sim roomba` for a robot and a film for a roof camera. ROBOTD_TREE names a folder in which the tree is kept for the next time.
 Control groups are real in there; device rules, memory limits and address filters are not enforced.
 """
 
@@ -13,9 +13,13 @@ import sys
 import textwrap
 from pathlib import Path
 
+import cv2
 import pytest
 
+from robotd.roof.setup import save_calibration
 from tests.robot_process import PUSHING, install_drivers
+from tests.roof_film import Film
+from tests.test_roof_watch import a_calibration
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = "python3,python3-venv,systemd,systemd-sysv,dbus,udev"
@@ -36,6 +40,15 @@ driver = "trial_follower"
 driver = "trial_labels"
 """
 
+ROOF = """
+[drivers.roof-1]
+driver = "replay"
+file = "/srv/film"
+fps = 25.0
+loop = true
+"""
+FILM_FRAMES, FILM_FPS = 80, 25.0  # 3.2 s: whole periods of both beacons, so that it may begin again
+
 # the driver that pushes hangs, and the whole loop with it, when it is told to
 PUSH = "            self.bus.commands.publish(DriveCommand(now(), 0.2, 0.0, self.name))\n"
 HANG = """            import os
@@ -46,6 +59,7 @@ HANG = """            import os
 FILES = {
     "etc/robotd/robotd.toml": CONFIG,
     "etc/robotd/calibration.toml": "",
+    "etc/robotd/roof.toml": ROOF,
     # many deaths in a short time are the purpose here
     "etc/systemd/system/robotd.service.d/trial.conf": "[Unit]\nStartLimitIntervalSec=0\nAfter=robot.service\n",
     "etc/systemd/system/robotd-guardian.service.d/trial.conf": "[Unit]\nAfter=robot.service\n",
@@ -73,7 +87,7 @@ FILES = {
 
 # runs inside: for each way to die, wait until the robot drives, do it, time the halt, wait until it drives again
 TRIAL = r"""
-import atexit, json, os, pwd, socket, subprocess, time
+import atexit, json, os, pathlib, pwd, socket, subprocess, time
 
 GROUP = "/sys/fs/cgroup/unified/system.slice/robotd.service/cgroup.kill"
 if not os.path.exists("/sys/fs/cgroup/unified"):
@@ -130,6 +144,49 @@ def stop():
     taken = time.monotonic() - start
     return {"taken_s": round(taken, 2), "result": run("systemctl", "show", "-P", "Result", "robotd")}
 
+def beacons_are_seen():
+    """Whether robotd-roof says now that it sees both beacons."""
+    try:
+        camera, = json.loads(pathlib.Path("/var/lib/robotd-solver/roof/status.json").read_text())["cameras"]
+    except OSError:
+        return False
+    return set(camera["beacons"]) == {"front", "rear"}
+
+def watch_roof():
+    """robotd-roof: starts, sees, is killed and comes back, ends; then with a mistake in its configuration."""
+    state, dwells = pathlib.Path("/var/lib/robotd-solver/roof"), []
+    seen = {"start": run("systemctl", "start", "robotd-roof")}
+    for name in ("first", "killed", "stopped"):
+        begun = time.monotonic()
+        while not beacons_are_seen() and time.monotonic() < begun + 60.0:
+            time.sleep(0.1)
+        process = pid("robotd-roof")
+        seen[name] = {
+            "sees": beacons_are_seen(),
+            "active": run("systemctl", "is-active", "robotd-roof"),
+            "user": pwd.getpwuid(int(run("awk", "/^Uid/ {print $2}", f"/proc/{process}/status"))).pw_name,
+        }
+        (state / "status.json").unlink()
+        if name == "first":
+            os.kill(int(process), 9)
+    seen["restarts"] = run("systemctl", "show", "-P", "NRestarts", "robotd-roof")
+    start = time.monotonic()
+    run("systemctl", "stop", "robotd-roof")
+    seen["taken_s"] = round(time.monotonic() - start, 2)
+    seen["result"] = run("systemctl", "show", "-P", "Result", "robotd-roof")
+    lines = [json.loads(line) for path in state.glob("dwells/*") for line in path.read_text().splitlines()]
+    seen["dwells"] = sorted({line["beacon"] for line in lines})
+    seen["owner"] = run("stat", "-c", "%U", str(state))
+    with open("/etc/robotd/roof.toml", "a") as file:
+        file.write("[roof]\nguard = 5\n")
+    run("systemctl", "start", "robotd-roof")
+    begun = time.monotonic()
+    while run("systemctl", "show", "-P", "Result", "robotd-roof") != "start-limit-hit" and time.monotonic() < begun + 90.0:
+        time.sleep(0.2)
+    seen["with a mistake"] = run("systemctl", "show", "-P", "Result", "robotd-roof")
+    seen["told"] = sorted({entry["MESSAGE"] for entry in entries("_SYSTEMD_UNIT=robotd-roof.service")})
+    return seen
+
 def entries(*matches):
     lines = run("journalctl", "-b", "-o", "json", *matches).splitlines()
     return [json.loads(line) for line in lines]
@@ -147,7 +204,7 @@ WAYS = {
     "systemctl restart robotd": lambda: run("systemctl", "restart", "--no-block", "robotd"),
     "systemctl restart robotd-guardian": lambda: run("systemctl", "restart", "--no-block", "robotd-guardian"),
 }
-UNITS = ("robot", "robotd", "robotd-guardian")
+UNITS = ("robot", "robotd", "robotd-guardian", "robotd-roof")
 JOURNAL = ("journalctl", "-b", "--no-pager", "-o", "short-monotonic", *(f"-u{unit}" for unit in UNITS))
 atexit.register(lambda: print(run(*JOURNAL)))
 seen = {}
@@ -169,7 +226,7 @@ for name, way in WAYS.items():
         "moved_m": halted and round(max(halted["rotations"]) - max(before["rotations"]), 3),
         "drives_again": again is not None,
         "back_s": round(back, 1),
-        "units": {unit: run("systemctl", "is-active", unit) for unit in UNITS[1:]},
+        "units": {unit: run("systemctl", "is-active", unit) for unit in UNITS[1:3]},
     }
 group = run("systemctl", "show", "-P", "ControlGroup", "robotd-guardian")
 guardian = pid("robotd-guardian")
@@ -209,7 +266,7 @@ wait(drives, 60.0)
 run("/opt/robotd/bin/robotctl", "estop")
 wait(is_halted, 10.0)
 stops["held by an emergency stop"] = stop()
-json.dump({"seen": seen, "facts": facts, "stops": stops}, open("/trial.json", "w"))
+json.dump({"seen": seen, "facts": facts, "stops": stops, "roof": watch_roof()}, open("/trial.json", "w"))
 """
 
 
@@ -272,7 +329,13 @@ def install(tree, folder):
         path = tree / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(textwrap.dedent(text))
-    for unit in ("robotd", "robotd-guardian"):
+    film = tree / "srv" / "film"
+    film.mkdir(exist_ok=True)
+    still = Film(fps=FILM_FPS, start=(160.0, 120.0), uneven=0.0, lost=0.0)
+    for k in range(FILM_FRAMES):
+        cv2.imwrite(str(film / f"{k:04d}.png"), still.draw(k / FILM_FPS))
+    save_calibration(a_calibration(), tree / "etc" / "robotd" / "roof-calibration.toml")
+    for unit in ("robotd", "robotd-guardian", "robotd-roof"):
         shutil.copy(ROOT / "systemd" / f"{unit}.service", tree / "etc" / "systemd" / "system")
     inside(tree, "systemctl", "enable", "-q", "robotd", "robotd-guardian", "robot", "trial")
     (tree / "trial.py").write_text(TRIAL)
@@ -333,6 +396,23 @@ def test_every_stop_is_clean_and_takes_less_than_5_s(trial):
     for state, stop in trial["stops"].items():
         assert stop["taken_s"] < 5.0, state
         assert stop["result"] == "success", state
+
+
+def test_the_watch_of_the_roof_cameras_starts_sees_comes_back_and_keeps_what_it_saw(trial):
+    roof = trial["roof"]
+    for moment in ("first", "killed", "stopped"):
+        assert roof[moment] == {"sees": True, "active": "active", "user": "robotd-solver"}
+    assert int(roof["restarts"]) == 1
+    assert roof["taken_s"] < 10.0
+    assert roof["result"] == "success"
+    assert roof["dwells"] == ["front", "rear"]
+    assert roof["owner"] == "robotd-solver"
+
+
+def test_the_watch_of_the_roof_cameras_names_a_mistake_and_gives_up(trial):
+    assert trial["roof"]["with a mistake"] == "start-limit-hit"
+    told = "robotd-solver: /etc/robotd/roof.toml [roof]: unknown key 'guard'; expected one of beacons, calibration, data, "
+    assert [line for line in trial["roof"]["told"] if line.startswith(told)]
 
 
 def test_systemctl_status_and_the_journal_tell_how_the_robot_fares(trial):
