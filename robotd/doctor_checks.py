@@ -18,8 +18,11 @@ from .errors import ConfigError
 from .secret_file import read_secret
 
 Level = Literal["ok", "note", "warning", "error"]
-RULES = "sudo cp etc/60-robotd.rules /etc/udev/rules.d/ && sudo udevadm control --reload && sudo udevadm trigger"
-USERS = "sudo cp systemd/robotd-sysusers.conf /etc/sysusers.d/robotd.conf && sudo systemd-sysusers"
+RULES = (
+    "sudo install -D -m 644 etc/60-robotd.rules /etc/udev/rules.d/60-robotd.rules && sudo udevadm control --reload && "
+    "sudo udevadm trigger"
+)
+USERS = "sudo install -D -m 644 systemd/robotd-sysusers.conf /etc/sysusers.d/robotd.conf && sudo systemd-sysusers"
 FREE_MB, FEW_MB = 2000, 500
 OLD_DAYS = 180
 # bits of the firmware's get_throttled (Raspberry Pi documentation, vcgencmd): now, and since the boot
@@ -187,9 +190,10 @@ def check_camera(
     try:
         fps, remarks = look(device)
     except Exception as error:
-        text = str(error)
-        mend = "stop what uses it, or robotctl record stop" if "in use" in text else "what is said there"
-        yield Finding("error", what, text, mend)
+        text, _, mend = str(error).partition("; ")
+        if "in use" in text:
+            mend = "stop what uses it, or robotctl record stop"
+        yield Finding("error", what, text, mend or "unplug it and plug it in again; robotctl logs tells more")
         return
     yield Finding("ok", what, f"opens, {fps:g} frames a second")
     for remark in remarks:

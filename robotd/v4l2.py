@@ -40,6 +40,11 @@ WAKE_S = 0.2  # the thread looks so often whether it shall end
 RELEASE_S = 3.0  # for a closed camera to give its device back
 KERNEL_STAMP_S = 1.0  # a stamp further from now than this is not on the monotonic clock
 FALLBACK_FPS = 15.0
+NO_ROOM = "its USB bus has no room"
+MORE_ROOM = (
+    "set fps = 15 in every camera's section, let the cameras look in pairs (camera_groups in [mission]), or put one on "
+    "another USB controller (Pi 5); a hub adds power, but no room"
+)
 COMPRESSED = ("MJPG", "JPEG")
 LUMINANCE_FIRST = ("GREY", "Y800", "NV12", "NV21", "YU12", "YV12")  # whole lines of grey, before any chroma
 PACKED = {"YUYV": 0, "YVYU": 0, "UYVY": 1, "VYUY": 1}  # which of every two bytes is grey
@@ -325,14 +330,13 @@ def _begin(device: str, camera: Negotiated) -> None:
         with contextlib.suppress(OSError):
             _start(camera)
             camera.remarks.append(
-                f"gives {camera.mode.fps:g} frames a second instead of {asked:g}, because its USB bus has no room for "
+                f"gives {camera.mode.fps:g} frames a second instead of {asked:g}, because {NO_ROOM} for "
                 "more (no space left on device); put it on another USB controller, or set fps in its section"
             )
             return
     raise DriverFault(
-        f"{device} cannot stream at {camera.given[0]}x{camera.given[1]}: its USB bus has no room (no space left on "
-        "device); put it on another USB controller, lower fps of every camera on this one, or let the cameras look in "
-        "turns (camera_groups in [mission])"
+        f"{device} cannot stream at {camera.given[0]}x{camera.given[1]}: {NO_ROOM} (no space left on device): the "
+        f"cameras on it, each asked for {asked:g} frames a second, reserve more than there is; {MORE_ROOM}"
     )
 
 

@@ -12,6 +12,8 @@ from robotd import doctor_checks
 from robotd.config import Config, UploadConfig
 from robotd.doctor import check_server, check_together, examine
 from robotd.doctor_checks import (
+    RULES,
+    USERS,
     Finding,
     check_calibration,
     check_camera,
@@ -24,8 +26,10 @@ from robotd.doctor_checks import (
     may_use,
 )
 from robotd.errors import DriverFault
+from robotd.v4l2 import MORE_ROOM, NO_ROOM
 
 EXAMPLE = Path(__file__).parent.parent / "etc" / "robotd.toml"
+README = EXAMPLE.parent.parent / "README.md"
 PORT = "/dev/serial/by-id/usb-FTDI"
 
 
@@ -128,6 +132,21 @@ def test_a_camera_is_opened_and_what_it_does_otherwise_is_told(tmp_path):
         raise DriverFault("/dev/video0 is in use by another program; end that one")
 
     assert "in use" in next(iter(check_camera(tmp_path, "front", device, People(), busy))).text
+
+    def crowded(_):
+        raise DriverFault(f"/dev/video0 cannot stream at 640x480: {NO_ROOM} (no space left on device); {MORE_ROOM}")
+
+    found = next(iter(check_camera(tmp_path, "front", device, People(), crowded)))
+    assert found.text.endswith("its USB bus has no room (no space left on device)")
+    assert all(words in found.mend for words in ("fps = 15", "pairs (camera_groups", "a hub adds power, but no room"))
+
+
+def test_what_the_checks_tell_to_type_is_what_the_readme_tells():
+    readme = README.read_text()
+    for command in (*USERS.split(" && "), *RULES.split(" && ")):
+        assert command in readme
+    rules = (README.parent / "etc" / "60-robotd.rules").read_text()
+    assert RULES in rules
 
 
 def test_a_full_read_only_or_worn_disk_is_noticed(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from typing import Any, cast
 from ..bind import ranged
 from ..control_socket import Client
 from ..plugin import Camera
+from ..v4l2 import MORE_ROOM, NO_ROOM
 from .table import Operations, method
 from .telemetry import counters
 
@@ -52,11 +53,7 @@ async def test(operations: Operations, client: Client, trial: Trial) -> Any:
                 )
                 for name in names
             ]
-            findings += [
-                _finding("error", f"camera {name}", f"failed while all ran: {supervisors[name].fault}", POWER)
-                for name in names
-                if supervisors[name].fault is not None
-            ]
+            findings += [_failed(name, fault) for name in names if (fault := supervisors[name].fault) is not None]
             findings.append(_base(base_before, counters(robot.assembly.base), trial.seconds))
         finally:
             for camera in started:
@@ -66,6 +63,13 @@ async def test(operations: Operations, client: Client, trial: Trial) -> Any:
 
 POWER = "a hub with a supply of its own, or fewer cameras on one USB bus"
 BUS = "set fps = 15 in every camera's section, or observe in pairs: [mission] camera_groups; see the README on cameras"
+
+
+def _failed(name: str, fault: str) -> dict[str, str]:
+    """A camera that cannot stream beside the others: its bus is full, or the power gave way."""
+    words, _, _ = fault.partition(f"; {MORE_ROOM}")
+    mend = MORE_ROOM if NO_ROOM in fault else POWER
+    return _finding("error", f"camera {name}", f"failed while all ran: {words}", mend)
 
 
 def _camera(
