@@ -5,8 +5,9 @@ unknown delay, and some commands are lost. The length of a flash is ours, though
 
 `settings` what must be known beforehand. `inquiry` chooses which labels flash in a slot, when and for how long, `pace`
 how many of them a stop has time for;
-`identifier` sees what flashed in the cameras; `decoder` turns that into probabilities, with `delays` for the timing and
-`memory` for where known labels must appear. `code` has the fixed code words of the scheme that does not adapt.
+`identifier` sees what flashed in the cameras; `decoder` turns that into probabilities, with `delays` and `throughput`
+for the timing and `memory` for where known labels must appear, which `alignment` sharpens. `code` has the fixed code
+words of the scheme that does not adapt.
 """
 
 from .delays import DelayModel

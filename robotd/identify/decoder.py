@@ -8,9 +8,8 @@ well enough to say where in an image they must appear, that is one more symbol.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,6 @@ TWICE = 0.1  # how likely a label that has its light makes another one in the sa
 LEAST = 1e-4  # probability from which a label is on a light's list of candidates
 LONGEST = 200  # labels on such a list
 _AT_ONCE = 1 << 19  # light-label pairs computed at once: about 10 MB
-SEARCHED = 12  # lights that decide on the throughput
 _NAMED = 0.9  # probability from which a light may teach the delays
 
 
@@ -69,14 +67,12 @@ class Posterior:
     """Per light: its likeliest `label`, that one's `probability`, that of `none` of ours, and all `candidates`.
 
     `candidates` holds for every light the labels of probability LEAST or more, likeliest first, and the probabilities.
-    `weight` is the log-likelihood of all that the lights did, up to what does not depend on the delays.
     """
 
     label: Numbers
     probability: Floats
     none: Floats
     candidates: list[tuple[Numbers, Floats]]
-    weight: float = 0.0
 
     def decided(self, threshold: float) -> NDArray[np.bool_]:
         """Lights (N,) that have a name."""
@@ -115,34 +111,6 @@ def decode(evidence: Sequence[Evidence], prior: Prior, lights: int, delays: Dela
     return _pass(evidence, prior, lights, delays, fetches, posterior)
 
 
-def search_interval(evidence: Sequence[Evidence], prior: Prior, lights: int, delays: DelayModel) -> float:
-    """Seconds between two commands under which the lights' answers are likeliest; `delays` is not changed.
-
-    Notes
-    -----
-    The likelihood has many maxima, one for every way in which some lights fit by accident: a grid over what `delays`
-    holds possible, with a step that moves the end of the longest queue by less than delays differ, so that the true one
-    is not stepped over. The lights that flashed most often decide.
-    """
-    flashed = np.zeros(lights)
-    for slot in evidence:
-        flashed[: len(slot.scores)] += slot.scores.max(axis=1, initial=0.0) > 3.0
-    chosen = np.sort(np.argsort(-flashed, kind="stable")[:SEARCHED])
-    few = [
-        replace(slot, scores=slot.scores[here], starts=slot.starts[here])
-        for slot in evidence
-        for here in [chosen[chosen < len(slot.scores)]]
-    ]
-    prior = replace(prior, ratios=prior.ratios[chosen]) if len(prior.near) else prior
-    longest = max((len(slot.labels) for slot in evidence), default=0)
-    best = (-math.inf, delays.interval)
-    for interval, log_prior in delays.intervals(longest):
-        fetches = [delays.fetch(slot.begun) for slot in few]
-        found = _pass(few, prior, len(chosen), delays, fetches, interval=interval)
-        best = max(best, (found.weight + log_prior, interval))
-    return best[1]
-
-
 def lateness(slot: Evidence, posterior: Posterior, lights: Numbers, interval: float) -> tuple[Floats, Numbers]:
     """How late those lights were that flashed as asked, their labels' commands being sent `interval` seconds apart.
 
@@ -174,10 +142,9 @@ def _pass(
     delays: DelayModel,
     fetches: Sequence[Floats],
     earlier: Posterior | None = None,
-    interval: float | None = None,
 ) -> Posterior:
     config = delays.config
-    times = [turns(slot.gates, interval or delays.interval) for slot in evidence]
+    times = [turns(slot.gates, delays.interval) for slot in evidence]
     elsewhere = np.zeros(len(prior.weights))  # how many lights of this stop each label has already, probably
     claims = [] if earlier is None else earlier.candidates
     for names, odds in claims:
@@ -187,7 +154,7 @@ def _pass(
     weights = prior.weights / max(float(prior.weights.sum()), 1e-30)
     ours = np.log(np.maximum((1.0 - config.none_fraction) * weights, 1e-30)).astype(np.float32)
     label, probability = np.zeros(lights, np.intp), np.zeros(lights)
-    none, candidates, weight = np.zeros(lights), [], 0.0
+    none, candidates = np.zeros(lights), []
     step = max(1, _AT_ONCE // max(1, len(weights)))
     for first in range(0, lights, step):
         part = slice(first, min(first + step, lights))
@@ -207,14 +174,13 @@ def _pass(
         nobody = np.exp(nobody - top)
         whole = odds.sum(axis=1, dtype=float) + nobody
         none[part] = nobody / whole
-        weight += float((top + np.log(whole)).sum())
         label[part] = np.argmax(odds, axis=1) if odds.shape[1] else 0
         for row, sum_ in zip(odds, whole, strict=True):
             kept = np.flatnonzero(row > LEAST * sum_)
             kept = kept[np.argsort(-row[kept], kind="stable")][:LONGEST]
             candidates.append((kept, row[kept] / sum_))
         probability[part] = odds.max(axis=1, initial=0.0) / whole
-    return Posterior(label, probability, none, candidates, weight)
+    return Posterior(label, probability, none, candidates)
 
 
 def _again(lights: Floats) -> Floats:
@@ -240,6 +206,27 @@ def _add(
     rows = len(scores)  # the lights after these were found later
     if not rows:
         return
+    right, instead, none = chances(scores, np.arange(part.start, part.start + rows) >= found, config)
+    if len(slot.labels):
+        late = starts.astype(np.float32)[:, slot.symbols] - times.astype(np.float32)
+        ratio = right[:, slot.symbols] * kernel(late)
+        ratio += instead[:, None]
+        total[:rows, slot.labels] += np.log(np.maximum(ratio, 1e-30))
+    nobody[:rows] += np.log(none)
+
+
+def chances(scores: Floats, new: NDArray[np.bool_], config: IdentifyConfig) -> tuple[Singles, Singles, Floats]:
+    """Likelihoods of lights' answers (N, Q) to one slot, relative to that under a label which was not asked.
+
+    Returns
+    -------
+    right : (N, Q) array
+        Under a label that was asked for each duration and flashed for it, at a usual moment.
+    instead : (N,) array
+        Under a label that was asked and whose command was lost.
+    none : (N,) array
+        Under something that is no label of ours; those lights that are `new` flashed, or nobody would know of them.
+    """
     top = np.maximum(scores.max(axis=1, initial=0.0), 0.0)[:, None]
     flash, dark = np.exp(scores - top), np.exp(-top)
     other = flash.mean(axis=1, keepdims=True)
@@ -247,10 +234,6 @@ def _add(
     unasked = (1.0 - surprise) * dark + surprise * other
     instead = (1.0 - lost) * surprise * other + lost * dark
     right = (1.0 - lost) * (1.0 - surprise) * flash
-    if len(slot.labels):
-        late = starts.astype(np.float32)[:, slot.symbols] - times.astype(np.float32)
-        ratio = (right / unasked).astype(np.float32)[:, slot.symbols] * kernel(late)
-        ratio += (instead / unasked).astype(np.float32)
-        total[:rows, slot.labels] += np.log(np.maximum(ratio, 1e-30))
-    flashes = np.where(np.arange(part.start, part.start + rows) < found, NONE_FLASHES, 1.0)[:, None]
-    nobody[:rows] += np.log(np.maximum((flashes * other + (1.0 - flashes) * dark) / unasked, 1e-300))[:, 0]
+    flashes = np.where(new, 1.0, NONE_FLASHES)[:, None]
+    none = np.maximum((flashes * other + (1.0 - flashes) * dark) / unasked, 1e-300)
+    return (right / unasked).astype(np.float32), (instead / unasked).astype(np.float32)[:, 0], none[:, 0]

@@ -191,11 +191,12 @@ class Kernel:
 
     def __init__(self, table: Floats) -> None:
         self._table = table.astype(np.float32)
+        self.largest = float(self._table.max())
 
     def __call__(self, lateness: NDArray[Any]) -> NDArray[np.float32]:
         """Ratio for lateness in seconds, any shape."""
         index = ((lateness + (STAMP_S + 0.5 * TABLE_STEP_S)) * (1.0 / TABLE_STEP_S)).astype(np.int32)
-        return self._table[np.clip(index, 0, len(self._table) - 1)]
+        return self._table.take(index, mode="clip")
 
 
 def _diffuse(phases: Floats, spread: float) -> Floats:

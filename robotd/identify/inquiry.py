@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from ..records import Floats
 from .code import code_words, largest_prime, on_off_words
-from .decoder import Evidence, Numbers, Posterior, Prior, decode, lateness, search_interval
+from .decoder import Evidence, Numbers, Posterior, Prior, decode, lateness
 from .delays import STAMP_S, DelayModel, turns
 from .pace import SEEN_AFTER, Pace
 from .settings import FlashRequest, IdentifyConfig
+from .throughput import search_interval
 
 Flags = NDArray[np.bool_]
 
@@ -343,7 +344,7 @@ class Inquiry:
     def posterior(self, prior: Prior, lights: int) -> Posterior:
         """Names of the lights after the answers so far, and the throughput that explains these best."""
         if not self.delays.rate_is_known and self._is_long and self.config.in_order:
-            self.delays.interval = search_interval(self.evidence, prior, lights, self.delays)
+            self.delays.interval = search_interval(self.evidence, prior, self.delays)
         return decode(self.evidence, prior, lights, self.delays)
 
     def learn(self, posterior: Posterior) -> None:

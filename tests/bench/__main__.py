@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import cv2
 
-from . import base, beacons, cameras, control, flash, line, robotctl, roof, solver
+from . import base, beacons, cameras, control, flash, identify, line, robotctl, roof, solver
 
 
 def main() -> None:
     """Print the table."""
     cv2.setNumThreads(1)
     rows = [
-        row for part in (line, flash, cameras, base, beacons, roof, control, robotctl, solver) for row in part.rows()
+        row
+        for part in (line, flash, identify, cameras, base, beacons, roof, control, robotctl, solver)
+        for row in part.rows()
     ]
     width = max(len(row.part) for row in rows)
     print(f"{'part':<{width}}  {'ms':>9}  {'ratio':>7}  yardstick (ms)")
