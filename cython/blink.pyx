@@ -1,67 +1,80 @@
 """Kernels of robotd.vision.blink: the numpy functions beside them there say what each does.
 
-Pixels are summed in cells of 2x2 and cells in apertures of 2x2, because a light of about one pixel sigma
+Pixels are averaged in cells of 2x2 and cells summed in apertures of 2x2, because a light of about one pixel sigma
 keeps most of its signal-to-noise ratio in a 4x4 sum, at a quarter of the work.
 """
 
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int8_t, int16_t, int32_t, uint8_t, uint16_t
 from libc.string cimport memcpy
 
 
-cdef inline int16_t _clipped(int16_t value, int16_t limit) noexcept nogil:
-    value = limit if value > limit else value
-    return -limit if value < -limit else value
+cdef enum:
+    LIMIT = 16  # of a change: 4 grey levels over an aperture; a label as weak as that still counts in full
+    SHIFT_ROUNDS = 5
+
+cdef double AGREE_PX = 0.1  # a tile that is further off has somebody in it
+cdef double BETTER = 0.9  # a shift must explain the tiles so much better than none
+cdef double QUIET_PX = 0.03  # what noise and passers-by make of a camera that stands still
 
 
-cdef void _cell_row(const uint8_t* top, const uint8_t* bottom, uint16_t* out, Py_ssize_t columns) noexcept nogil:
+cdef inline int16_t _clipped(int16_t value) noexcept nogil:
+    value = LIMIT if value > LIMIT else value
+    return -LIMIT if value < -LIMIT else value
+
+
+cdef void _cell_row(const uint8_t* top, const uint8_t* bottom, uint8_t* out, Py_ssize_t columns) noexcept nogil:
     cdef Py_ssize_t j
     for j in range(columns):
-        out[j] = <uint16_t>(<uint16_t>(top[2 * j] + top[2 * j + 1]) + <uint16_t>(bottom[2 * j] + bottom[2 * j + 1]))
+        out[j] = <uint8_t>(
+            (<uint16_t>(top[2 * j] + top[2 * j + 1]) + <uint16_t>(bottom[2 * j] + bottom[2 * j + 1]) + 2) >> 2
+        )
 
 
 cdef void _difference_row(
-    const uint16_t* now0, const uint16_t* now1, const uint16_t* old0, const uint16_t* old1, int8_t* out, Py_ssize_t columns
+    const uint8_t* now0, const uint8_t* now1, const uint8_t* old0, const uint8_t* old1, int8_t* out, Py_ssize_t columns
 ) noexcept nogil:
     cdef Py_ssize_t j
     cdef int16_t new, old
     for j in range(columns - 1):
         new = <int16_t>(now0[j] + now0[j + 1] + now1[j] + now1[j + 1])
         old = <int16_t>(old0[j] + old0[j + 1] + old1[j] + old1[j + 1])
-        out[j] = <int8_t>_clipped(<int16_t>(new - old), 63)
+        out[j] = <int8_t>_clipped(<int16_t>(new - old))
 
 
 cdef void _moved_row(
-    const uint16_t* now0,
-    const uint16_t* now1,
-    const uint16_t* old0,
-    const uint16_t* old1,
+    const uint8_t* now0,
+    const uint8_t* now1,
+    const uint8_t* old0,
+    const uint8_t* old1,
     const int16_t* down,
     const int16_t* right,
-    int32_t move_down,
-    int32_t move_right,
+    int16_t move_down,
+    int16_t move_right,
     int8_t* out,
     Py_ssize_t columns,
 ) noexcept nogil:
     cdef Py_ssize_t j
-    cdef int32_t change
+    cdef int16_t new, old, moved
     for j in range(columns - 1):
-        change = <int32_t>now0[j] + now0[j + 1] + now1[j] + now1[j + 1]
-        change -= <int32_t>old0[j] + old0[j + 1] + old1[j] + old1[j + 1]
-        change += (down[j] * move_down + right[j] * move_right) >> 8
-        change = 63 if change > 63 else change
-        out[j] = <int8_t>(-63 if change < -63 else change)
+        new = <int16_t>(now0[j] + now0[j + 1] + now1[j] + now1[j + 1])
+        old = <int16_t>(old0[j] + old0[j + 1] + old1[j] + old1[j + 1])
+        moved = <int16_t>((<int32_t>down[j] * move_down) >> 16)
+        moved += <int16_t>((<int32_t>right[j] * move_right) >> 16)
+        moved += 1  # because both were rounded down
+        out[j] = <int8_t>_clipped(<int16_t>(new - old + moved))
 
 
 cdef void _alternation_row(const int8_t* now, const int8_t* old, int16_t* total, Py_ssize_t columns) noexcept nogil:
     cdef Py_ssize_t j
     for j in range(columns - 1):
-        total[j] = <int16_t>(total[j] - (<int16_t>(now[j] * old[j]) >> 2))
+        total[j] = <int16_t>(total[j] - <int16_t>(now[j] * old[j]))
 
 
-def sum_cells(const uint8_t[:, ::1] image, uint16_t[:, ::1] cells, Py_ssize_t before, Py_ssize_t after):
+def sum_cells(const uint8_t[:, ::1] image, uint8_t[:, ::1] cells, Py_ssize_t before, Py_ssize_t after):
     cdef Py_ssize_t rows = cells.shape[0] - before - after, columns = cells.shape[1] - before - after, i, j
-    cdef Py_ssize_t whole = cells.shape[1] * sizeof(uint16_t)
-    cdef uint16_t* row
+    cdef Py_ssize_t whole = cells.shape[1]
+    cdef uint8_t* row
     with nogil:
         for i in range(rows):
             row = &cells[before + i, 0]
@@ -77,8 +90,8 @@ def sum_cells(const uint8_t[:, ::1] image, uint16_t[:, ::1] cells, Py_ssize_t be
 
 
 def accumulate(
-    const uint16_t[:, ::1] cells,
-    const uint16_t[:, ::1] lagged,
+    const uint8_t[:, ::1] cells,
+    const uint8_t[:, ::1] lagged,
     const int16_t[:, ::1] down,
     const int16_t[:, ::1] right,
     int move_down,
@@ -109,8 +122,8 @@ def accumulate(
                     &lagged[k + 1, before],
                     &down[i, 0],
                     &right[i, 0],
-                    move_down,
-                    move_right,
+                    <int16_t>move_down,
+                    <int16_t>move_right,
                     &difference[i, 0],
                     columns,
                 )
@@ -138,7 +151,7 @@ def add_block(
 
 
 def shift_moments(
-    const uint16_t[:, ::1] cells,
+    const uint8_t[:, ::1] cells,
     const int16_t[:, ::1] reference,
     const int16_t[:, ::1] down,
     const int16_t[:, ::1] right,
@@ -148,8 +161,8 @@ def shift_moments(
 ):
     cdef Py_ssize_t rows = moments.shape[0], columns = moments.shape[1], i, j, a, b
     cdef Py_ssize_t high = reference.shape[0] // rows, wide = reference.shape[1] // columns
-    cdef const uint16_t* top
-    cdef const uint16_t* bottom
+    cdef const uint8_t* top
+    cdef const uint8_t* bottom
     cdef const int16_t* old
     cdef const int16_t* gx
     cdef const int16_t* gy
@@ -169,7 +182,7 @@ def shift_moments(
                     y = 0
                     d = 0
                     for j in range(wide):
-                        change = <int32_t>top[j] + top[j + 1] + bottom[j] + bottom[j + 1] - old[j]
+                        change = 4 * (<int32_t>top[j] + top[j + 1] + bottom[j] + bottom[j + 1]) - 2 - old[j]  # means are rounded up
                         x += gx[j] * change
                         y += gy[j] * change
                         d += change
@@ -179,8 +192,65 @@ def shift_moments(
                 i += step
 
 
+def agreed_shift(const float[:, ::1] moments, const double[:, ::1] tiles):
+    cdef Py_ssize_t count = tiles.shape[0], turn, k
+    cdef double a, b, c, p, q, determinant, u = 0.0, v = 0.0, x, y, miss, still, scale, weight
+    cdef double missed = 0.0, unmoved = 0.0
+    with nogil:
+        for turn in range(SHIFT_ROUNDS + 1):
+            a = b = c = p = q = missed = unmoved = 0.0
+            for k in range(count):
+                x = moments[k, 0] - tiles[k, 3] * moments[k, 2]
+                y = moments[k, 1] - tiles[k, 4] * moments[k, 2]
+                scale = 1.0 / (AGREE_PX * (tiles[k, 0] + tiles[k, 2]) + 1.0)
+                still = scale * sqrt(x * x + y * y)
+                unmoved += still if still < 1.0 else 1.0
+                weight = 1.0
+                if turn > 0:
+                    miss = x - tiles[k, 0] * u - tiles[k, 1] * v
+                    still = y - tiles[k, 1] * u - tiles[k, 2] * v
+                    miss = scale * sqrt(miss * miss + still * still)
+                    missed += miss if miss < 1.0 else 1.0
+                    weight = 1.0 / (1.0 + miss * miss)
+                a += weight * tiles[k, 0]
+                b += weight * tiles[k, 1]
+                c += weight * tiles[k, 2]
+                p += weight * x
+                q += weight * y
+            if turn == SHIFT_ROUNDS:
+                break
+            determinant = a * c - b * b
+            if determinant <= 1e-3 * a * c or a * c <= 0.0:
+                u = v = 0.0
+                break
+            u = (c * p - b * q) / determinant
+            v = (a * q - b * p) / determinant
+            if fabs(u) < QUIET_PX and fabs(v) < QUIET_PX:
+                u = v = 0.0
+                break
+        if missed > BETTER * unmoved:
+            u = v = 0.0
+    return u, v
+
+
+cdef inline void _order(float* low, float* high) noexcept nogil:
+    cdef float a = low[0], b = high[0]
+    low[0] = a if a < b else b
+    high[0] = b if a < b else a
+
+
+cdef inline void _sort8(float* x) noexcept nogil:
+    """Batcher's network, because branches that cannot be predicted cost more than comparisons."""
+    _order(x, x + 1); _order(x + 2, x + 3); _order(x + 4, x + 5); _order(x + 6, x + 7)
+    _order(x, x + 2); _order(x + 1, x + 3); _order(x + 4, x + 6); _order(x + 5, x + 7)
+    _order(x + 1, x + 2); _order(x + 5, x + 6)
+    _order(x, x + 4); _order(x + 1, x + 5); _order(x + 2, x + 6); _order(x + 3, x + 7)
+    _order(x + 2, x + 4); _order(x + 3, x + 5)
+    _order(x + 1, x + 2); _order(x + 3, x + 4); _order(x + 5, x + 6)
+
+
 def aperture_series(
-    const uint16_t[:, :, ::1] ring,
+    const uint8_t[:, :, ::1] ring,
     const Py_ssize_t[::1] order,
     const Py_ssize_t[::1] rows,
     const Py_ssize_t[::1] columns,
@@ -189,10 +259,10 @@ def aperture_series(
     float[:, ::1] levels,
 ):
     cdef Py_ssize_t n = rows.shape[0], frames = order.shape[0], c, f, i, j, k, m
-    cdef const uint16_t* cell
+    cdef const uint8_t* cell
     cdef Py_ssize_t stride = ring.shape[2]
     cdef float side[8]
-    cdef float keep, level
+    cdef float level
     with nogil:
         for f in range(frames):
             for c in range(n):
@@ -216,13 +286,7 @@ def aperture_series(
                 for k in range(4):
                     side[k] *= 0.25
                     side[k + 4] *= <float>(1.0 / 3.0)
-                for k in range(1, 8):
-                    keep = side[k]
-                    m = k - 1
-                    while m >= 0 and side[m] > keep:
-                        side[m + 1] = side[m]
-                        m -= 1
-                    side[m + 1] = keep
+                _sort8(side)
                 level = <float>0.25 * (side[2] + side[3] + side[4] + side[5])
                 levels[c, f] = level
                 values[c, f] = (

@@ -244,7 +244,7 @@ def test_a_shaking_camera_is_measured_and_does_not_hide_a_label():
     film = list(shaken_film(shifts, rng))
     shake = Shake(3)
     shake.refer(film[0], np.zeros(2))
-    cells = np.zeros((film[0].shape[0] // 2 + 8, film[0].shape[1] // 2 + 8), np.uint16)
+    cells = np.zeros((film[0].shape[0] // 2 + 8, film[0].shape[1] // 2 + 8), np.uint8)
     found = []
     for frame in film:
         kernels.sum_cells(frame, cells, 3, 5)
@@ -259,7 +259,7 @@ def test_lamps_that_flicker_are_measured_and_taken_off():
     rng = np.random.default_rng(4)
     wall = shelves(rng, (144, 192))
     shake = Shake(3)
-    cells = np.zeros((80, 104), np.uint16)
+    cells = np.zeros((80, 104), np.uint8)
     first = np.rint(wall).astype(np.uint8)
     shake.refer(first, np.zeros(2))
     kernels.sum_cells(np.rint(1.03 * wall).astype(np.uint8), cells, 3, 5)

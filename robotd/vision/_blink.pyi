@@ -1,10 +1,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint16], before: int, after: int) -> None: ...
+def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint8], before: int, after: int) -> None: ...
 def accumulate(
-    cells: NDArray[np.uint16],
-    lagged: NDArray[np.uint16],
+    cells: NDArray[np.uint8],
+    lagged: NDArray[np.uint8],
     down: NDArray[np.int16],
     right: NDArray[np.int16],
     move_down: int,
@@ -18,7 +18,7 @@ def add_block(
     block: NDArray[np.int16], low: int, high: int, total: NDArray[np.float32], clipped: NDArray[np.float32]
 ) -> None: ...
 def shift_moments(
-    cells: NDArray[np.uint16],
+    cells: NDArray[np.uint8],
     reference: NDArray[np.int16],
     down: NDArray[np.int16],
     right: NDArray[np.int16],
@@ -26,8 +26,9 @@ def shift_moments(
     step: int,
     moments: NDArray[np.float32],
 ) -> None: ...
+def agreed_shift(moments: NDArray[np.float32], tiles: NDArray[np.float64]) -> tuple[float, float]: ...
 def aperture_series(
-    ring: NDArray[np.uint16],
+    ring: NDArray[np.uint8],
     order: NDArray[np.intp],
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],

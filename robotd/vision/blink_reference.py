@@ -5,20 +5,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+LIMIT = 16  # of a change: 4 grey levels over an aperture; a label as weak as that still counts in full
 
-def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint16], before: int, after: int) -> None:
-    """Sum 2x2 pixels of `image` (H, W) into `cells`, with `before` and `after` copies of the outermost cells around.
+SHIFT_ROUNDS = 5
+AGREE_PX = 0.1  # a tile that is further off has somebody in it
+BETTER = 0.9  # a shift must explain the tiles so much better than none
+QUIET_PX = 0.03  # what noise and passers-by make of a camera that stands still
+
+
+def sum_cells(image: NDArray[np.uint8], cells: NDArray[np.uint8], before: int, after: int) -> None:
+    """Rounded means of 2x2 pixels of `image` (H, W), with `before` and `after` copies of the outermost cells around.
 
     `cells` is (H // 2 + before + after, W // 2 + before + after).
     """
     rows, columns = cells.shape[0] - before - after, cells.shape[1] - before - after
-    pixels = image[: 2 * rows, : 2 * columns].astype(np.uint16)
-    cells[:] = np.pad(pixels.reshape(rows, 2, columns, 2).sum(axis=(1, 3), dtype=np.uint16), (before, after), "edge")
+    pixels = image[: 2 * rows, : 2 * columns].astype(np.uint16).reshape(rows, 2, columns, 2)
+    cells[:] = np.pad((pixels.sum(axis=(1, 3)) + 2) >> 2, (before, after), "edge")
 
 
 def accumulate(
-    cells: NDArray[np.uint16],
-    lagged: NDArray[np.uint16],
+    cells: NDArray[np.uint8],
+    lagged: NDArray[np.uint8],
     down: NDArray[np.int16],
     right: NDArray[np.int16],
     move_down: int,
@@ -32,19 +39,19 @@ def accumulate(
 
     Parameters
     ----------
-    cells, lagged : uint16
+    cells, lagged : uint8
         As of `sum_cells`: of the frame, and of the one a lag ago.
     down, right : (h, w) int16
-        Change of each aperture per pixel that the camera's picture moves up or left.
+        Change of each aperture's sixteen pixels per pixel that the camera's picture moves up or left.
     move_down, move_right : int
-        By how much the picture moved over the lag, in 1/256 px.
+        By how much the picture moved over the lag, in 1/16384 px, less than 2 px.
     difference : (h, w) int8, out
-        Change of each 2x2-cell aperture over the lag, less what the move explains, clipped to +-63; entry [i, j] is
+        Change of each 2x2-cell aperture over the lag, less what the move explains, clipped to +-LIMIT; entry [i, j] is
         the aperture whose first cell is (i, j). The last row and column are left alone.
     lagged_difference : (h, w) int8
         The same, one lag ago.
     total : (h, w) int16, updated
-        Loses floor(difference * lagged_difference / 4).
+        Loses difference * lagged_difference.
     before : int
         As of `sum_cells`.
     """
@@ -52,10 +59,12 @@ def accumulate(
     inside = np.s_[before : before + rows, before : before + columns]
     change = cells[inside].astype(np.int32) - lagged[inside]
     change = change[:-1, :-1] + change[:-1, 1:] + change[1:, :-1] + change[1:, 1:]
-    change += (down[:-1, :-1].astype(np.int32) * move_down + right[:-1, :-1].astype(np.int32) * move_right) >> 8
-    difference[:-1, :-1] = np.clip(change, -63, 63)
-    product = difference[:-1, :-1].astype(np.int16) * lagged_difference[:-1, :-1]
-    total[:-1, :-1] -= product >> 2
+    if move_down or move_right:
+        for gradient, move in ((down, move_down), (right, move_right)):
+            change += (gradient[:-1, :-1].astype(np.int32) * move) >> 16
+        change += 1  # because both were rounded down
+    difference[:-1, :-1] = np.clip(change, -LIMIT, LIMIT)
+    total[:-1, :-1] -= difference[:-1, :-1].astype(np.int16) * lagged_difference[:-1, :-1]
 
 
 def add_block(
@@ -67,7 +76,7 @@ def add_block(
 
 
 def shift_moments(
-    cells: NDArray[np.uint16],
+    cells: NDArray[np.uint8],
     reference: NDArray[np.int16],
     down: NDArray[np.int16],
     right: NDArray[np.int16],
@@ -79,10 +88,10 @@ def shift_moments(
 
     Parameters
     ----------
-    cells : uint16
+    cells : uint8
         As of `sum_cells`.
     reference, down, right : (h, w) int16
-        The reference's apertures (sums of 2x2 cells), and their gradients per pixel.
+        The reference's apertures (sums of their sixteen pixels), and their gradients per pixel.
     before : int
         As of `sum_cells`.
     step : int
@@ -94,15 +103,55 @@ def shift_moments(
     rows, columns = moments.shape[:2]
     high, wide = height // rows, width // columns
     part = cells[before : before + height + 1, before : before + width + 1].astype(np.int64)
-    change = part[:-1, :-1] + part[1:, :-1] + part[:-1, 1:] + part[1:, 1:] - reference
+    # less 2, because the means of pixels are rounded up by an eighth of a grey level on average
+    change = 4 * (part[:-1, :-1] + part[1:, :-1] + part[:-1, 1:] + part[1:, 1:]) - 2 - reference
     for a in range(rows):
         for b in range(columns):
             tile = np.s_[a * high : (a + 1) * high : step, b * wide : (b + 1) * wide]
             moments[a, b] = [(right[tile] * change[tile]).sum(), (down[tile] * change[tile]).sum(), change[tile].sum()]
 
 
+def agreed_shift(moments: NDArray[np.float32], tiles: NDArray[np.float64]) -> tuple[float, float]:
+    """By how much the reference has moved from a picture; zero while noise could be the cause.
+
+    Parameters
+    ----------
+    moments : (T, 3) float32
+        As of `shift_moments`.
+    tiles : (T, 5)
+        Of every tile of the reference: sums of right^2, right * down and down^2, both less their means; the means.
+
+    Returns
+    -------
+    (float, float)
+        u, v in px: iteratively reweighted least squares, in which a tile weighs the less, the less it agrees.
+    """
+    xx, xy, yy, mean_x, mean_y = tiles.T
+    x, y, d = moments.T.astype(float)
+    x, y = x - mean_x * d, y - mean_y * d
+    scale = AGREE_PX * (xx + yy) + 1.0
+    weights = np.ones(len(x))
+    shift = np.zeros(2)
+    miss = np.zeros(len(x))
+    for _ in range(SHIFT_ROUNDS):
+        a, b, c = float(weights @ xx), float(weights @ xy), float(weights @ yy)
+        p, q = float(weights @ x), float(weights @ y)
+        determinant = a * c - b * b
+        if determinant <= 1e-3 * a * c or a * c <= 0.0:
+            return 0.0, 0.0
+        shift = np.array([(c * p - b * q) / determinant, (a * q - b * p) / determinant])
+        if np.abs(shift).max() < QUIET_PX:
+            return 0.0, 0.0
+        miss = np.hypot(x - xx * shift[0] - xy * shift[1], y - xy * shift[0] - yy * shift[1]) / scale
+        weights = 1.0 / (1.0 + miss**2)
+    still = np.hypot(x, y) / scale
+    if np.minimum(miss, 1.0).sum() > BETTER * np.minimum(still, 1.0).sum():
+        return 0.0, 0.0
+    return float(shift[0]), float(shift[1])
+
+
 def aperture_series(
-    ring: NDArray[np.uint16],
+    ring: NDArray[np.uint8],
     order: NDArray[np.intp],
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
@@ -114,14 +163,14 @@ def aperture_series(
 
     Parameters
     ----------
-    ring : (R, h, w) uint16
+    ring : (R, h, w) uint8
         Cells of the frames.
     order : (F,) intp
         Which of them, in order of time.
     rows, columns : (N,) intp
         First cell of each aperture; at least 3 cells from the first and 5 from the last row and column.
-    light : (1021,) float32
-        Linear light of every cell sum.
+    light : (256,) float32
+        Linear light of every grey level.
     values : (N, F) float32, out
         Light of the four cells minus four times the level.
     levels : (N, F) float32, out

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from . import blink, thesis_blink
+from . import thesis_blink
 from .blink import FlashDetector, Track
 from .matching import Matches
 from .thesis_blink import ThesisFlashDetector
@@ -71,22 +71,18 @@ def explain_blink(detector: FlashDetector, shape: tuple[int, int]) -> FlashExpla
     """The state of `FlashDetector` in images of this shape (H, W)."""
     threshold = detector.config.min_score(shape)
     unit = "alternation in the pattern's rhythm"
-    if detector._ring is None or not detector._blocks:
+    if detector._alternation is None or not detector._alternation.is_ready:
         return FlashExplanation(np.zeros(shape, np.float32), unit, (), (), threshold)
-    energy = np.maximum(detector._alternation()[0] + detector._total, 0.0)
-    change = cv2.resize(np.sqrt(energy), shape[::-1], interpolation=cv2.INTER_NEAREST)
+    change = cv2.resize(np.sqrt(detector._alternation.energy()), shape[::-1], interpolation=cv2.INTER_NEAREST)
     clusters = [_track(detector, track) for track in detector.tracks]
     triggers = []
     known = len(detector.tracks)
-    rows, columns = detector._candidates()
-    rows = np.concatenate([np.array([track.row for track in detector.tracks], np.intp), rows])
-    columns = np.concatenate([np.array([track.column for track in detector.tracks], np.intp), columns])
+    places = [(track.row, track.column) for track in detector.tracks]
+    watched, examined = detector._alternation.candidates(places, detector.config.max_candidates)
+    rows, columns = np.divmod(watched[:examined], detector._alternation.shape[1])
+    rows, columns = detector._joined(detector.tracks, rows, columns)
     if len(rows) and detector._times[-1][1] - detector._times[0][1] >= 1.4 * detector.config.pattern.period:
-        numbers, times = detector._recent()
-        values, levels = detector._curves(numbers, rows, columns)
-        matches = detector._matcher.match(
-            times, values, levels, detector._shifts[numbers % blink._RING], detector._flickers(numbers, rows)
-        )
+        matches, _ = detector._match(detector._curves(rows, columns))
         for k, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
             u, v = _centre(row, column)
             why = _why_not(detector, matches, k, threshold)

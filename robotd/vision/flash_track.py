@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .flash_memory import BEFORE
 from .matching import Cleared
 from .pattern import Look
 from .spot import Spot, fit_spot
 
 Floats = NDArray[np.float64]
 
-BEFORE, AFTER = 3, 5  # cells around an aperture's first one that its ring needs: 8x8 in all
-_WHITE = 985  # mean sum of four pixels, from which on noise alone makes some white
-_LOOKS = 10  # kept, of one window each
+_WHITE = 246  # grey level of four pixels, from which on noise alone makes some white
+_LOOKS = 14  # kept, of one window each
 
 
 @dataclass(slots=True, eq=False)
@@ -45,15 +45,15 @@ class Track:
     spot: Spot | None = None
     fitted: float = -1.0
 
-    def add(self, cells: NDArray[np.uint16], light: NDArray[np.float32], rest: Cleared, t: float) -> None:
+    def add(self, cells: NDArray[np.uint8], light: NDArray[np.float32], rest: Cleared, t: float) -> None:
         """Add M frames that show the light.
 
         Parameters
         ----------
-        cells : (M, 8, 8) uint16 array
-            Sums of 2x2 pixels around the aperture.
-        light : (1021,) array
-            Linear light of every such sum.
+        cells : (M, 8, 8) uint8 array
+            Around the aperture.
+        light : (256,) array
+            Linear light of every grey level.
         rest : Cleared
             The frames, and what they are regressed on.
         t : float

@@ -27,6 +27,7 @@ Indices = NDArray[np.intp]
 _LEAST = 0.01  # energy per frame below which a pattern hardly touches the window
 _HIDDEN = 0.02  # relative change of the light around a place that says somebody stands before it,
 _SPREADS = 5.0  # beyond so many of its usual spreads
+_LEAST_SEEN = 0.4  # of the frames that are known
 _OUTLIER = 4.5  # spreads of the residual
 _ENOUGH = 0.3  # of a period's energy that must be within the window, to count by itself
 _LOOK_S, _LOOK_PITCH_S = 0.03, 0.0015  # starts so far from the best match are weighed, at this pitch
@@ -40,7 +41,8 @@ _MOST_OUTLIERS = 0.12  # of the frames that count: with more, it is not the patt
 class Matches:
     """Best match of each light curve: arrays over places.
 
-    `score` and `margin` are log-likelihood ratios against noise and against steady blinking; `start` in seconds,
+    `score` and `margin` are log-likelihood ratios against noise and against steady blinking (as large as `score` where
+    that is small); `start` in seconds,
     `light` in the curves' unit, `variance` of the curve about the match; `regular`: several periods carry the pattern
     and none lacks it; `frames` that counted.
     """
@@ -85,7 +87,13 @@ class Matcher:
         self._step = max(8, int(np.ceil(pattern.period / min(0.02, max(0.004, 0.3 * shortest)))))
 
     def match(
-        self, times: Floats, values: Singles, levels: Singles, shifts: Floats, flicker: Singles | None = None
+        self,
+        times: Floats,
+        values: Singles,
+        levels: Singles,
+        shifts: Floats,
+        flicker: Singles | None = None,
+        known: NDArray[np.bool_] | None = None,
     ) -> Matches:
         """Match N light curves.
 
@@ -98,9 +106,13 @@ class Matcher:
             Shift of the picture in px.
         flicker : (N, F) array, optional
             Relative change of the lamps' light near each place.
+        known : (N, F) bool array, optional
+            False in frames of which nothing is known of the place.
         """
+        if known is None:
+            known = np.ones(values.shape, bool)
         values, levels, _ = _steadied(values, levels, flicker)
-        seen = self._seen(levels)
+        seen = self._seen(levels) & known
         starts, single = self._starts(times)
         basis = _moved(shifts)
         found, residual = self._search(times, values, seen, starts, single, basis)
@@ -114,6 +126,7 @@ class Matcher:
             for name in Matches.__slots__:
                 getattr(found, name)[doubtful] = getattr(again, name)
         found.regular &= lost <= _MOST_OUTLIERS * seen.sum(axis=1)
+        found.regular &= found.frames >= _LEAST_SEEN * known.sum(axis=1)
         return found
 
     def cleared(
@@ -145,7 +158,11 @@ class Matcher:
         residual = values - light * wave - dark
         spread = _spread(residual[None].astype(np.float32), seen[None])[0]
         seen &= np.abs(residual) <= _OUTLIER * spread + 0.35 * abs(light)
-        basis = np.linalg.qr(_moved(shifts[seen]).astype(float))[0].T
+        basis = _moved(shifts[seen]).astype(float)
+        if basis.shape[1] == 1:
+            basis = basis.T / np.sqrt(max(len(basis), 1))
+        else:
+            basis = np.linalg.qr(basis)[0].T
         wave = wave[seen]
         on = wave.sum()
         shift = wave @ shifts[seen] / on if on > 0.0 else np.zeros(2)
@@ -224,15 +241,17 @@ class Matcher:
         wave, gain, light = _regressed(y, weights, frames, wave)
         left = np.maximum(energy - gain, 1e-6)
         residual = (y - light[:, None] * wave) * weights
+        steady = energy.copy()
+        steady[promising] = self._steady_residual(times, y[promising], weights[promising], energy[promising])
         half = 0.5 * (frames.astype(float) - basis.shape[1])
         matches = Matches(
             score=half * np.log(energy / left),
-            margin=half * np.log(self._steady_residual(times, y, weights, energy) / left),
+            margin=half * np.log(steady / left),
             start=begin,
             periods=periods.astype(np.intp),
             light=light.astype(float),
             variance=left / np.maximum(frames - 2.0, 1.0),
-            regular=_is_regular(y, weights, parts, light) & (frames >= 0.4 * len(times)),
+            regular=_is_regular(y, weights, parts, light),
             frames=frames.astype(float),
         )
         return matches, residual
@@ -263,12 +282,12 @@ class Matcher:
 
     def _steady_residual(self, times: Floats, y: Singles, weights: Singles, energy: Floats) -> Floats:
         """What the best steady blinking (a sine with its third harmonic) leaves of each light curve's energy."""
-        least = energy
-        angle = 2.0 * np.pi * (times - times[0])
-        for hertz in self._steady_hz:
-            waves = np.stack([np.ones_like(times), *(f(k * hertz * angle) for k in (1, 3) for f in (np.cos, np.sin))])
-            least = np.minimum(least, energy - _explained(y, weights, waves.astype(np.float32)))
-        return np.maximum(least, 1e-6)
+        if not len(y):
+            return energy
+        angle = 2.0 * np.pi * np.multiply.outer(self._steady_hz, times - times[0])
+        ones = np.ones_like(angle)
+        waves = np.stack([ones, *(f(k * angle) for k in (1, 3) for f in (np.cos, np.sin))], axis=1)
+        return np.asarray(np.maximum(energy - _explained(y, weights, waves.astype(np.float32)).max(axis=1), 1e-6))
 
 
 def _regressed(y: Singles, weights: Singles, frames: Singles, wave: Singles) -> tuple[Singles, Singles, Singles]:
@@ -350,14 +369,16 @@ def _without(values: Singles, weights: Singles, basis: Singles) -> Singles:
 
 
 def _explained(y: Singles, weights: Singles, waves: Singles) -> Floats:
-    """Energy (N,) that waves (B, F) explain of light curves which are zero where their weight is."""
-    products = (waves[:, None, :] * waves[None, :, :]).reshape(-1, waves.shape[1])
-    normal = np.einsum("nf,kf->nk", weights, products).reshape(len(y), len(waves), len(waves)).astype(float)
+    """Energy (N, H) that each of H sets of waves (H, B, F) explains of light curves (N, F), zero where weights are."""
+    sets, size, frames = waves.shape
+    products = (waves[:, :, None, :] * waves[:, None, :, :]).reshape(-1, frames)
+    normal = np.einsum("nf,kf->nk", weights, products).reshape(len(y), sets, size, size).astype(float)
     # because sampled waves may be aliases of one another
-    normal += 1e-3 * np.maximum(weights.sum(axis=1), 1.0)[:, None, None] * np.eye(len(waves))
-    right = np.einsum("nf,kf->nk", y, waves).astype(float)
-    factors = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-    return np.asarray(2.0 * np.einsum("nb,nb->n", factors, right) - np.einsum("na,nab,nb->n", factors, normal, factors))
+    normal += 1e-3 * np.maximum(weights.sum(axis=1), 1.0)[:, None, None, None] * np.eye(size)
+    right = np.einsum("nf,kf->nk", y, waves.reshape(-1, frames)).reshape(len(y), sets, size).astype(float)
+    factors = np.linalg.solve(normal, right[..., None])[..., 0]
+    explained = 2.0 * np.einsum("nhb,nhb->nh", factors, right)
+    return np.asarray(explained - np.einsum("nha,nhab,nhb->nh", factors, normal, factors))
 
 
 def _spread(residual: Singles, seen: NDArray[np.bool_]) -> Floats:

@@ -16,10 +16,6 @@ Shorts = NDArray[np.int16]
 BANDS = 6  # of rows, because a rolling shutter sees lamps flicker in waves
 _TILES = (BANDS, 8)
 _ROW_STEP = 4  # every fourth row of apertures is looked at
-_ROUNDS = 5
-_AGREE_PX = 0.1  # a tile that is further off has somebody in it
-_BETTER = 0.9  # a shift must explain the tiles so much better than none
-_QUIET_PX = 0.03  # what noise and passers-by make of a camera that stands still
 
 
 class Shake:
@@ -52,9 +48,8 @@ class Shake:
         tiles_down, tiles_right = self._tiled(self._down), self._tiled(self._right)
         self._mean = np.stack([tiles_right.mean(axis=1), tiles_down.mean(axis=1)])
         tiles_right, tiles_down = tiles_right - self._mean[0][:, None], tiles_down - self._mean[1][:, None]
-        self._xx = (tiles_right**2).sum(axis=1)
-        self._xy = (tiles_right * tiles_down).sum(axis=1)
-        self._yy = (tiles_down**2).sum(axis=1)
+        products = ((tiles_right**2), tiles_right * tiles_down, tiles_down**2)
+        self._tiles = np.stack([product.sum(axis=1) for product in products] + list(self._mean), axis=1)
         self._sums = np.maximum(self._tiled(self._reference).sum(axis=1), 1.0)
         self._counted = tiles_right.shape[1]
         self._brightness = self.brightness
@@ -68,43 +63,18 @@ class Shake:
         tiles = picture[: _TILES[0] * high, : _TILES[1] * wide].reshape(_TILES[0], high, _TILES[1], wide)
         return tiles[:, ::_ROW_STEP].transpose(0, 2, 1, 3).reshape(_TILES[0] * _TILES[1], -1).astype(float)
 
-    def measure(self, cells: NDArray[np.uint16]) -> Floats:
+    def measure(self, cells: NDArray[np.uint8]) -> Floats:
         """Shift (u, v) in px of a picture against the first one; the reference's while noise could be the cause.
 
         Its change of `brightness` is measured as well, by the tiles' median, because people cover some.
         """
         kernels.shift_moments(cells, self._reference, self._down, self._right, self._before, _ROW_STEP, self._moments)
-        moments = self._moments.reshape(-1, 3).T.astype(float)
-        shift = self._shift(moments)
-        change = (moments[2] - self._counted * (shift @ self._mean)) / self._sums
+        shift = np.array(kernels.agreed_shift(self._moments.reshape(-1, 3), self._tiles))
+        moved = self._counted * (shift @ self._mean)
+        change = (self._moments[:, :, 2].ravel() - moved) / self._sums
         middle = np.sort(change.reshape(_TILES), axis=1)[:, _TILES[1] // 2 - 1 : _TILES[1] // 2 + 1]
         self.brightness = self._brightness + 0.5 * (middle[:, 0] + middle[:, 1])
         return np.asarray(self.offset - shift)
-
-    def _shift(self, moments: Floats) -> Floats:
-        """By how much the reference has moved from a picture; zero while noise could be the cause."""
-        xd, yd = moments[0] - self._mean[0] * moments[2], moments[1] - self._mean[1] * moments[2]
-        weights = np.ones(len(xd))
-        shift = np.zeros(2)
-        miss = np.zeros(len(xd))
-        scale = _AGREE_PX * (self._xx + self._yy) + 1.0
-        for _ in range(_ROUNDS):
-            a, b, c = float(weights @ self._xx), float(weights @ self._xy), float(weights @ self._yy)
-            p, q = float(weights @ xd), float(weights @ yd)
-            determinant = a * c - b * b
-            if determinant <= 1e-3 * a * c or a * c <= 0.0:
-                return np.zeros(2)
-            shift = np.array([(c * p - b * q) / determinant, (a * q - b * p) / determinant])
-            if np.abs(shift).max() < _QUIET_PX:
-                return np.zeros(2)
-            miss_x = xd - self._xx * shift[0] - self._xy * shift[1]
-            miss_y = yd - self._xy * shift[0] - self._yy * shift[1]
-            miss = np.hypot(miss_x, miss_y) / scale
-            weights = 1.0 / (1.0 + miss**2)
-        still = np.hypot(xd, yd) / scale
-        if np.minimum(miss, 1.0).sum() > _BETTER * np.minimum(still, 1.0).sum():
-            return np.zeros(2)
-        return shift
 
 
 def _padded(image: NDArray[np.uint8]) -> Shorts:
