@@ -36,7 +36,7 @@ cdef class Descent(Normals):
         self.S, self.V_inverse = arena.doubles(self.values), arena.doubles(6 * self.labels)
         self.right, self.step = arena.doubles(self.size), arena.doubles(self.size)
         self.point_step = arena.doubles(3 * self.labels)
-        self.trial_frame = arena.doubles(STOP * self.stops + CAMERA * self.cameras + 2)
+        self.trial_frame = arena.doubles(self.entries)
         self.trial_points = arena.doubles(3 * self.labels)
         self.cg = arena.doubles(4 * self.size)
         self.at = arena.offsets(self.stops)
@@ -82,7 +82,7 @@ cdef class Descent(Normals):
         return np.asarray(end), np.asarray(end_points), self.now.cost, spent, converged
 
     cdef int _check(self, const double[::1] frame, const double[:, ::1] points) except -1:
-        if frame.shape[0] != STOP * self.stops + CAMERA * self.cameras + 2:
+        if frame.shape[0] != self.entries:
             raise ValueError(f"the frame vector has {frame.shape[0]} entries, not those of this problem")
         if points.shape[0] != self.labels or points.shape[1] != 3:
             raise ValueError(f"need points of shape ({self.labels}, 3), got ({points.shape[0]}, {points.shape[1]})")
@@ -92,7 +92,7 @@ cdef class Descent(Normals):
         self, double* frame, double* points, const Shape* loss, int iterations, double tolerance, double damping,
         bint* converged,
     ) noexcept nogil:
-        cdef int iteration, k, entries = STOP * self.stops + CAMERA * self.cameras + 2
+        cdef int iteration, k, entries = self.entries
         cdef double predicted, cost, trial, ratio
         cdef Normal swapped
         self.factored = False

@@ -303,55 +303,57 @@ cdef class Normals(Structure):
         for k in range(self.size):
             j = self.entry_of[k]
             n.g[k] += self.prior[j] * frame[j]
-        for k in range(STOP * self.stops + CAMERA * self.cameras + 2):
+        for k in range(self.entries):
             n.cost += self.prior[k] * frame[k] * frame[k]
         n.cost *= 0.5
 
     cdef void _moves(self, const double* frame, const Shape* loss, Normal* n) noexcept nogil:
         cdef int m, i, j, k, a, b, wa, wb, r
-        cdef double c, s, dx, dy, weight, square, scale, turn, factor
+        cdef double c, s, dx, dy, weight, square, scale, turn, drift, factor, way
         cdef const double* z
         cdef const double* L
         cdef const double* x
         cdef const double* y
         cdef double e[3]
         cdef double whitened[3]
-        cdef double D[24]  # (3, 8): before, after, odometry factors
-        cdef double LD[24]
+        cdef double D[3 * MOVE]  # before, after, odometry factors
+        cdef double LD[3 * MOVE]
+        cdef double shared[3 * ODOMETRY]
         cdef double* block
-        cdef int chosen[8]
+        cdef int column[ODOMETRY]
         cdef int* active
-        scale, turn = frame[STOP * self.stops + CAMERA * self.cameras], frame[STOP * self.stops + CAMERA * self.cameras + 1]
+        scale, turn, drift = frame[self.odometry_entry], frame[self.odometry_entry + 1], frame[self.odometry_entry + 2]
         for m in range(self.moves):
             a, b = self.before[m], self.after[m]
-            z, L = self.moved + 13 * m, self.moved + 13 * m + 3
-            factor = L[9]
+            z, L = self.moved + 14 * m, self.moved + 14 * m + 3
+            factor, way = L[9], L[10]
             x, y = frame + STOP * a, frame + STOP * b
             c, s = cos(x[2]), sin(x[2])
             dx, dy = y[0] - x[0], y[1] - x[1]
             memset(D, 0, sizeof(D))
             e[0] = c * dx + s * dy
             e[1] = -s * dx + c * dy
-            D[3], D[4], D[11], D[12], D[21] = c, s, -s, c, 1.0
+            D[3], D[4], D[MOVE + 3], D[MOVE + 4], D[2 * MOVE + 5] = c, s, -s, c, 1.0
             for i in range(3):
                 for j in range(3):
-                    D[8 * i + j] = -D[8 * i + 3 + j]
-            D[2], D[10] = e[1], -e[0]
-            D[6], D[14], D[23] = -factor * z[0], -factor * z[1], -factor * z[2]
-            e[0] -= (1.0 + factor * scale) * z[0]
-            e[1] -= (1.0 + factor * scale) * z[1]
-            e[2] = _wrapped(y[2] - x[2] - z[2]) - factor * turn * z[2]
+                    D[MOVE * i + j] = -D[MOVE * i + 3 + j]
+            D[2], D[MOVE + 2] = e[1], -e[0]
+            D[6], D[MOVE + 6], D[2 * MOVE + 7] = -factor * z[0], -factor * z[1], -factor * z[2]
+            D[8], D[MOVE + 8], D[2 * MOVE + 8] = 0.5 * factor * way * z[1], -0.5 * factor * way * z[0], -factor * way
+            e[0] += D[6] * scale + D[8] * drift - z[0]
+            e[1] += D[MOVE + 6] * scale + D[MOVE + 8] * drift - z[1]
+            e[2] = _wrapped(y[2] - x[2] - z[2]) + D[2 * MOVE + 7] * turn + D[2 * MOVE + 8] * drift
             square = 0.0
             for i in range(3):
                 whitened[i] = L[3 * i] * e[0] + L[3 * i + 1] * e[1] + L[3 * i + 2] * e[2]
                 square += whitened[i] * whitened[i]
-                for j in range(8):
-                    LD[8 * i + j] = L[3 * i] * D[j] + L[3 * i + 1] * D[8 + j] + L[3 * i + 2] * D[16 + j]
+                for j in range(MOVE):
+                    LD[MOVE * i + j] = L[3 * i] * D[j] + L[3 * i + 1] * D[MOVE + j] + L[3 * i + 2] * D[2 * MOVE + j]
             n.cost += _loss(1, loss.move_width, square, &weight)
             wa, wb = self.width[a], self.width[b]
             # a stop's free entries start with its planar ones, unless these are held fixed
-            self._factor(n, a, LD, 8, 3, 3, whitened, weight)
-            self._factor(n, b, LD + 3, 8, 3, 3, whitened, weight)
+            self._factor(n, a, LD, MOVE, 3, 3, whitened, weight)
+            self._factor(n, b, LD + 3, MOVE, 3, 3, whitened, weight)
             block = n.M + STOP * STOP * m
             for i in range(wb):
                 if self.active[STOP * b + i] > 2:
@@ -361,27 +363,45 @@ cdef class Normals(Structure):
                         continue
                     for r in range(3):
                         block[i * wa + j] += (
-                            weight * LD[8 * r + 3 + self.active[STOP * b + i]] * LD[8 * r + self.active[STOP * a + j]]
+                            weight * LD[MOVE * r + 3 + self.active[STOP * b + i]]
+                            * LD[MOVE * r + self.active[STOP * a + j]]
                         )
-            active = self.active + STOP * self.stops + CAMERA * self.cameras
+            active = self.active + self.odometry_entry
             for i in range(self.odometry_width):
-                k = self.odometry_first + i
+                column[i] = self.odometry_first + i
                 for r in range(3):
-                    n.g[self.first[self.stops] + k] += weight * LD[8 * r + 6 + active[i]] * whitened[r]
-                    for j in range(wa):
-                        if self.active[STOP * a + j] < 3:
-                            n.G[<Py_ssize_t>self.globals * self.first[a] + k * wa + j] += (
-                                weight * LD[8 * r + 6 + active[i]] * LD[8 * r + self.active[STOP * a + j]]
-                            )
-                    for j in range(wb):
-                        if self.active[STOP * b + j] < 3:
-                            n.G[<Py_ssize_t>self.globals * self.first[b] + k * wb + j] += (
-                                weight * LD[8 * r + 6 + active[i]] * LD[8 * r + 3 + self.active[STOP * b + j]]
-                            )
-                    for j in range(self.odometry_width):
-                        n.G[
-                            <Py_ssize_t>self.globals * (self.first[self.stops] + k) + self.odometry_first + j
-                        ] += weight * LD[8 * r + 6 + active[i]] * LD[8 * r + 6 + active[j]]
+                    shared[ODOMETRY * r + i] = LD[MOVE * r + 6 + active[i]]
+            self._shared(n, column, shared, ODOMETRY, self.odometry_width, 3, whitened, weight)
+            self._coupled(n, a, LD, MOVE, 3, column, shared, ODOMETRY, self.odometry_width, 3, weight)
+            self._coupled(n, b, LD + 3, MOVE, 3, column, shared, ODOMETRY, self.odometry_width, 3, weight)
+
+    cdef void _shared(
+        self, Normal* n, const int* column, const double* J, int pitch, int count, int rows, const double* e, double weight
+    ) noexcept nogil:
+        """Add J' J and J' e of a factor to columns of the last node."""
+        cdef int i, j, r, from_ = self.first[self.stops]
+        cdef double* out
+        for i in range(count):
+            out = n.G + <Py_ssize_t>self.globals * (from_ + column[i])
+            for r in range(rows):
+                n.g[from_ + column[i]] += weight * J[r * pitch + i] * e[r]
+                for j in range(count):
+                    out[column[j]] += weight * J[r * pitch + i] * J[r * pitch + j]
+
+    cdef void _coupled(
+        self, Normal* n, int stop, const double* J, int pitch, int entries, const int* column, const double* shared,
+        int shared_pitch, int count, int rows, double weight
+    ) noexcept nogil:
+        """Add what a factor makes columns of the last node and a stop have to do with each other."""
+        cdef int i, j, r, w = self.width[stop]
+        cdef int* active = self.active + STOP * stop
+        cdef double* out
+        for i in range(count):
+            out = n.G + <Py_ssize_t>self.globals * self.first[stop] + column[i] * w
+            for j in range(w):
+                if active[j] < entries:
+                    for r in range(rows):
+                        out[j] += weight * shared[r * shared_pitch + i] * J[r * pitch + active[j]]
 
     cdef void _factor(
         self, Normal* n, int stop, const double* J, int pitch, int entries, int rows, const double* e, double weight
@@ -401,11 +421,18 @@ cdef class Normals(Structure):
                         )
 
     cdef void _roofs(self, const double* frame, const Shape* loss, Normal* n) noexcept nogil:
-        cdef int i, k, j, f
-        cdef double weight, square, x, y, w, u, v
+        cdef int i, k, j, f, plane, count
+        cdef double weight, square, x, y, w, u, v, step
         cdef const double* R
-        cdef const double* b
-        cdef const double* H
+        cdef const double* given
+        cdef const double* axes
+        cdef const double* own
+        cdef int* active
+        cdef int column[ROOF + BEACON]
+        cdef double shared[2 * (ROOF + BEACON)]
+        cdef double b[3]
+        cdef double H[9]
+        cdef double h[3]
         cdef double arm[3]
         cdef double skewed[9]
         cdef double moved[9]
@@ -414,7 +441,15 @@ cdef class Normals(Structure):
         cdef double e[2]
         for i in range(self.roofs):
             f = self.roof_stop[i]
-            R, b, H = self.stop_axes + 13 * f, self.roof + 15 * i, self.roof + 15 * i + 6
+            R, given = self.stop_axes + 13 * f, self.roof + 15 * i
+            plane = self.roof_plane[2 * i]
+            axes, own = self.plane_axes + 9 * ROOF * plane, frame + self.plane_entry[plane]
+            for k in range(9):
+                H[k] = given[6 + k]
+                for j in range(ROOF):
+                    H[k] += own[j] * axes[9 * j + k]
+            own = frame + self.plane_entry[self.roof_plane[2 * i + 1]]
+            b[0], b[1], b[2] = given[0] + own[0], given[1] + own[1], given[2]
             for k in range(3):
                 arm[k] = R[k] * b[0] + R[3 + k] * b[1] + R[6 + k] * b[2]
             x, y = R[9] + arm[0], R[10] + arm[1]
@@ -437,12 +472,31 @@ cdef class Normals(Structure):
                     skewed[j] = by_world[2 * k] * moved[j] + by_world[2 * k + 1] * moved[3 + j]
                 J[5 * k + 3] = skewed[0]
                 J[5 * k + 4] = skewed[1] * R[12] - skewed[2] * R[11]
-                e[k] = ((u if k == 0 else v) - b[3 + k]) / b[5]
+                e[k] = ((u if k == 0 else v) - given[3 + k]) / given[5]
                 square += e[k] * e[k]
                 for j in range(5):
-                    J[5 * k + j] /= b[5]
+                    J[5 * k + j] /= given[5]
             n.cost += _loss(1, loss.move_width, square, &weight)
             self._factor(n, f, J, 5, 5, 2, e, weight)
+            count = self.plane_width[plane]
+            active = self.active + self.plane_entry[plane]
+            for j in range(count):
+                column[j] = self.plane_first[plane] + j
+                own = axes + 9 * active[j]
+                for k in range(3):
+                    h[k] = own[3 * k] * x + own[3 * k + 1] * y + own[3 * k + 2]
+                shared[j] = (h[0] - u * h[2]) / (w * given[5])
+                shared[ROOF + BEACON + j] = (h[1] - v * h[2]) / (w * given[5])
+            plane = self.roof_plane[2 * i + 1]
+            active = self.active + self.plane_entry[plane]
+            for j in range(self.plane_width[plane]):
+                column[count] = self.plane_first[plane] + j
+                for k in range(2):
+                    step = by_world[2 * k] * R[3 * active[j]] + by_world[2 * k + 1] * R[3 * active[j] + 1]
+                    shared[(ROOF + BEACON) * k + count] = step / given[5]
+                count += 1
+            self._shared(n, column, shared, ROOF + BEACON, count, 2, e, weight)
+            self._coupled(n, f, J, 5, 5, column, shared, ROOF + BEACON, count, 2, weight)
 
 
 cdef inline void _add(

@@ -3,6 +3,10 @@
 cdef enum:
     STOP = 5
     CAMERA = 10
+    ROOF = 8
+    BEACON = 2
+    ODOMETRY = 3
+    MOVE = 9  # columns of a move: 3 of either stop and the odometry factors
 
 
 cdef class Structure:
@@ -10,16 +14,19 @@ cdef class Structure:
 
     cdef Arena arena
     cdef int size
-    cdef int stops, cameras, labels, count, moves, roofs, knowns, globals, nodes
+    cdef int stops, cameras, planes, labels, count, moves, roofs, knowns, globals, nodes, entries
     cdef bint tilts
     cdef int alike  # the width of all stops but the first that have one, or 0
     cdef double* points
-    cdef int* width  # of each stop; the last node holds cameras and odometry factors
+    cdef int* width  # of each stop; the last node holds cameras, roofs and odometry factors
     cdef int* first
-    cdef int* active  # (stops, 5) and then (cameras, 10) and (2,): which entries are free
+    cdef int* active  # (stops, 5) and then (cameras, 10) and so on: which entries are free
     cdef int* camera_width
     cdef int* camera_first  # among the columns of the last node
-    cdef int odometry_width, odometry_first
+    cdef int* plane_width  # of each roof camera, then of each beacon
+    cdef int* plane_first
+    cdef int* plane_entry
+    cdef int odometry_width, odometry_first, odometry_entry
     cdef int64_t* entry_of  # of each column, its index in the frame vector
     cdef double* prior
     cdef int* label_at  # labels by the stop that first saw them, because neighbours in memory are then used together
@@ -51,8 +58,10 @@ cdef class Structure:
     cdef double* t_robot_camera
     cdef int* before
     cdef int* after
-    cdef double* moved  # 3 measured, 9 root of information, 1 if the odometry factors apply, else 0
+    cdef double* moved  # 3 measured, 9 root of information, 1 if the odometry factors apply, else 0, metres of way
     cdef int* roof_stop
+    cdef int* roof_plane  # of each sighting, its roof camera, then, from `planes` on, its beacon
+    cdef double* plane_axes  # of each roof camera, (8, 3, 3)
     cdef double* roof  # 3 beacon, 2 pixels, sigma, 9 homography
     cdef int* known_point
     cdef double* known  # 3 position, sigma
@@ -63,16 +72,17 @@ cdef class Structure:
         const int64_t[::1] camera, const int64_t[::1] point, const double[:, ::1] uv, const double[::1] sigma,
         const double[::1] probability, const int64_t[::1] before, const int64_t[::1] after,
         const double[:, ::1] measured, const double[:, :, ::1] roots, const double[::1] by_wheels,
-        const int64_t[::1] roof_stop,
+        const double[::1] travelled, const int64_t[::1] roof_stop, const int64_t[::1] roof_camera,
+        const int64_t[::1] roof_beacon, const double[:, :, :, ::1] roof_axes, int beacons,
         const double[:, ::1] beacon, const double[:, ::1] roof_uv, const double[::1] roof_sigma,
         const double[:, :, ::1] H_image_world, const int64_t[::1] known_point, const double[:, ::1] known_position,
         const double[::1] known_sigma,
     ):
-        cdef int c, f, k, i, j
+        cdef int c, f, k, i, j, entry
         cdef Arena arena = Arena()
         self.arena = arena
         self.stops, self.cameras, self.labels, self.count = stops, lens.shape[0], labels, stop.shape[0]
-        self.nodes = stops + 1
+        self.nodes, self.entries = stops + 1, columns.shape[0]
         self.width, self.first = arena.ints(self.nodes), arena.ints(self.nodes)
         self.active = arena.ints(columns.shape[0])
         self.entry_of = <int64_t*>arena.take(columns.shape[0] * sizeof(int64_t))
@@ -97,8 +107,17 @@ cdef class Structure:
         for c in range(self.cameras):
             self.camera_first[c] = self.size - self.first[stops]
             self.camera_width[c] = self._free(columns, STOP * stops + CAMERA * c, CAMERA)
-        self.odometry_first = self.size - self.first[stops]
-        self.odometry_width = self._free(columns, STOP * stops + CAMERA * self.cameras, 2)
+        self.planes = roof_axes.shape[0]
+        entry, k = STOP * stops + CAMERA * self.cameras, self.planes + beacons
+        self.plane_width, self.plane_first, self.plane_entry = arena.ints(k), arena.ints(k), arena.ints(k)
+        for i in range(k):
+            self.plane_first[i], self.plane_entry[i] = self.size - self.first[stops], entry
+            self.plane_width[i] = self._free(columns, entry, ROOF if i < self.planes else BEACON)
+            entry += ROOF if i < self.planes else BEACON
+        if entry + ODOMETRY != self.entries:
+            raise ValueError(f"expected {entry + ODOMETRY} columns, got {self.entries}")
+        self.odometry_first, self.odometry_entry = self.size - self.first[stops], entry
+        self.odometry_width = self._free(columns, entry, ODOMETRY)
         self.globals = self.width[stops] = self.size - self.first[stops]
         self.lens = arena.doubles(LENS * self.cameras)
         self.R_robot_camera, self.t_robot_camera = arena.doubles(9 * self.cameras), arena.doubles(3 * self.cameras)
@@ -111,19 +130,26 @@ cdef class Structure:
                 self.t_robot_camera[3 * c + k] = t_robot_camera[c, k]
         self.moves, self.roofs, self.knowns = before.shape[0], roof_stop.shape[0], known_point.shape[0]
         self.before, self.after = arena.ints(self.moves), arena.ints(self.moves)
-        self.moved = arena.doubles(13 * self.moves)
+        self.moved = arena.doubles(14 * self.moves)
         for i in range(self.moves):
             if not 0 <= before[i] < after[i] < stops:
                 raise ValueError(f"a move must lead from an earlier to a later stop, got {before[i]} to {after[i]}")
             self.before[i], self.after[i] = before[i], after[i]
             for k in range(3):
-                self.moved[13 * i + k] = measured[i, k]
+                self.moved[14 * i + k] = measured[i, k]
             for k in range(9):
-                self.moved[13 * i + 3 + k] = roots[i, k // 3, k % 3]
-            self.moved[13 * i + 12] = by_wheels[i]
+                self.moved[14 * i + 3 + k] = roots[i, k // 3, k % 3]
+            self.moved[14 * i + 12], self.moved[14 * i + 13] = by_wheels[i], travelled[i]
         self.roof_stop, self.roof = arena.ints(self.roofs), arena.doubles(15 * self.roofs)
+        self.roof_plane, self.plane_axes = arena.ints(2 * self.roofs), arena.doubles(9 * ROOF * self.planes)
+        for i in range(self.planes):
+            for k in range(9 * ROOF):
+                self.plane_axes[9 * ROOF * i + k] = roof_axes[i, k // 9, k // 3 % 3, k % 3]
         for i in range(self.roofs):
+            if not (0 <= roof_stop[i] < stops and 0 <= roof_camera[i] < self.planes and 0 <= roof_beacon[i] < beacons):
+                raise ValueError(f"roof sighting {i}: stop, camera or beacon out of range")
             self.roof_stop[i] = roof_stop[i]
+            self.roof_plane[2 * i], self.roof_plane[2 * i + 1] = roof_camera[i], self.planes + roof_beacon[i]
             for k in range(3):
                 self.roof[15 * i + k] = beacon[i, k]
             self.roof[15 * i + 3], self.roof[15 * i + 4] = roof_uv[i, 0], roof_uv[i, 1]

@@ -364,6 +364,8 @@ class Priors:
     centre_px: float = 0.0
     odometry_scale: float = 0.0
     odometry_turn: float = 0.0
+    odometry_drift: float = 0.0  # rad/m, by which unequal wheels turn the robot on a straight
+    beacon_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,11 +379,15 @@ class KnownLabel:
 
 @dataclass(frozen=True, slots=True)
 class RoofCamera:
-    """A camera on the ceiling; `H_world_image` maps undistorted pixels to world x, y at the beacons' height."""
+    """A camera on the ceiling; `H_world_image` maps undistorted pixels to world x, y at the beacons' height.
+
+    `covariance` (9 x 9) is that of the inverse's numbers, row by row, at unit norm; None: the homography is exact.
+    """
 
     name: str
     size: tuple[int, int]
     H_world_image: Matrix3
+    covariance: tuple[tuple[float, ...], ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ FARTHEST_ON_ROBOT_M = 5.0
 FARTHEST_LABEL_M = 2000.0
 HIGHEST_LABEL_M = 50.0
 LONGEST_MOVE_M = 500.0
-WIDEST_PRIOR = {"tilt_rad": 0.5, "camera_rotation_rad": 1.0, "camera_translation_m": 2.0}
+WIDEST_PRIOR = {"tilt_rad": 0.5, "camera_rotation_rad": 1.0, "camera_translation_m": 2.0, "beacon_m": 1.0}
 FULL_TURN = 2.0 * np.pi + 1e-9
 METRES, RADIANS = "metres; are these millimetres?", "radians; are these degrees?"
 SHORTEST_FOCAL = 0.02  # of the image's width: wider than any lens
@@ -78,6 +78,22 @@ def check_header(parts: Mapping[str, Any], problems: Problems) -> None:
             _size(roof.size, f"roof_cameras[{index}].size", problems)
             if np.linalg.matrix_rank(_scaled(roof.H_world_image)[0]) < 3:
                 problems.add(f"roof_cameras[{index}].H_world_image", "is singular; expected an invertible homography")
+            check_roof(roof, f"roof_cameras[{index}]", problems)
+
+
+def check_roof(roof: RoofCamera, path: str, problems: Problems) -> None:
+    """Check the covariance of a homography."""
+    rows = roof.covariance
+    if rows is None:
+        return
+    if len(rows) != 9 or any(len(row) != 9 for row in rows):
+        problems.add(f"{path}.covariance", "expected 9 rows of 9 numbers")
+        return
+    values = np.array(rows)
+    if not np.isfinite(values).all():
+        problems.add(f"{path}.covariance", "found a number that is not finite")
+    elif not np.linalg.eigvalsh(values)[0] >= -1e-6 * np.abs(values).max():
+        problems.add(f"{path}.covariance", "is not positive semidefinite")
 
 
 def check_units(survey: Survey, problems: Problems) -> None:

@@ -15,6 +15,7 @@ from robotd.geometry.transforms import (
     rotation_matrix,
     rotation_vector,
     se2_compose,
+    se2_inverse,
     se2_relative,
     transform_points,
     wrap_angle,
@@ -102,6 +103,15 @@ def path_of(line):
     xy = np.column_stack([np.interp(s, arc, vertices[:, k]) for k in (0, 1)])
     slope = np.gradient(xy, axis=0)
     return np.column_stack([xy, np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))]), s
+
+
+def true_poses(store):
+    """(S, 3) of the stops, in the axes of the first."""
+    poses, arc = path_of(store["line"])
+    poses = poses[[int(np.argmin(np.abs(arc - a))) for a in store["line"]["stops"]]]
+    poses = se2_compose(se2_inverse(poses[0]), poses)
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    return poses
 
 
 def true_moves(store):

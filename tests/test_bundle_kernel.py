@@ -36,7 +36,8 @@ pytest.importorskip("robotd.solver._bundle", reason="built without extensions")
 
 NONE = Priors()
 TILT = Priors(tilt_rad=0.005)
-ALL = Priors(0.005, 0.001, 0.001, 0.3, 0.3, 0.004, 0.004)
+ALL = Priors(0.005, 0.001, 0.001, 0.3, 0.3, 0.004, 0.004, 0.01, 0.002)
+ROOFS = ("roof", "exact", "idle")
 LENSES = {
     "pinhole": ("brown-conrady", (), None),
     "brown-conrady": ("brown-conrady", (-0.06, 0.012, 0.0002, 0.0003, -0.001), None),
@@ -79,7 +80,7 @@ def make_problem(priors, lens="brown-conrady", stops=9, labels=40, seed=0, world
             for name, place in rig.beacons.items():
                 at = T[:3, :3] @ place + T[:3, 3]
                 h = np.linalg.inv(H) @ [at[0], at[1], 1.0]
-                beacons.append(BeaconSighting("roof", name, *(h[:2] / h[2]).tolist(), 1.0))
+                beacons.append(BeaconSighting(ROOFS[s % 2], name, *(h[:2] / h[2]).tolist(), 1.0))
         leg = 1 + s * legs // stops
         move = None
         if s and leg == records[-1].leg:
@@ -93,7 +94,10 @@ def make_problem(priors, lens="brown-conrady", stops=9, labels=40, seed=0, world
         at = Pose(*pose.tolist())
         records.append(Stop(leg, s + 1, "2026-11-21T10:00:00Z", at, move, tuple(sightings), tuple(beacons), motions))
     known = tuple(KnownLabel(f"{n:03d}", tuple(points[n].tolist())) for n in range(4)) if world == "known" else ()
-    roofs = (RoofCamera("roof", (640, 480), tuple(map(tuple, H.tolist()))),) if world == "roof" else ()
+    rows, roofs = tuple(map(tuple, H.tolist())), ()
+    if world == "roof":  # of three cameras one is exact and one sees nothing
+        spread = tuple(map(tuple, np.diag(rng.uniform(0.5e-8, 2e-8, 9)).tolist()))
+        roofs = tuple(RoofCamera(name, (640, 480), rows, spread if name != "exact" else None) for name in ROOFS)
     survey = Survey(
         "test", rig, tuple(records), sigmas=Sigmas(0.5, 1.0), priors=priors, known_labels=known, roof_cameras=roofs
     )
@@ -101,9 +105,9 @@ def make_problem(priors, lens="brown-conrady", stops=9, labels=40, seed=0, world
     frame = np.zeros(len(problem.prior_sigma))
     frame[: 5 * stops].reshape(-1, 5)[:, :3] = poses
     noise = np.where(np.isfinite(problem.prior_sigma), problem.prior_sigma, 0.01)
-    frame += 0.5 * noise * rng.normal(size=len(frame))
     where = points[[int(name) for name in problem.labels]]
-    return problem, State(frame, where + rng.normal(0.0, 0.03, where.shape))
+    where = where + rng.normal(0.0, 0.03, where.shape)
+    return problem, State(frame + 0.5 * noise * rng.normal(size=len(frame)), where)
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -130,6 +134,31 @@ def test_the_descent_takes_the_steps_of_numpy(priors, world, lens):
         assert ours.cost == pytest.approx(theirs.cost, rel=1e-9)
         np.testing.assert_allclose(ours.state.frame, theirs.state.frame, atol=1e-8)
         np.testing.assert_allclose(ours.state.points, theirs.state.points, atol=1e-8)
+
+
+@pytest.mark.parametrize("world", ["roof", "motions"])
+def test_derivatives_are_those_of_differences(world):
+    problem, state = make_problem(ALL, world=world)
+    adjustment = Adjustment(problem, problem.sightings)
+    linear = adjustment.linearise(state, SQUARE)
+    size, step = len(state.frame), 1e-6
+    moves, roofs = np.zeros((size, *linear.move.shape)), np.zeros((size, *linear.roof.shape))
+    for entry in range(size):
+        ends = [replace(state, frame=state.frame + sign * step * np.eye(size)[entry]) for sign in (1, -1)]
+        ahead, behind = (adjustment.linearise(end, SQUARE) for end in ends)
+        moves[entry], roofs[entry] = (
+            (getattr(ahead, name) - getattr(behind, name)) / (2.0 * step) for name in ("move", "roof")
+        )
+    rows = np.arange(len(linear.move))[:, None]
+    for which, found in (
+        (5 * adjustment.before[:, None] + np.arange(3), linear.move_before),
+        (5 * adjustment.after[:, None] + np.arange(3), linear.move_after),
+        (size + np.tile(np.arange(-3, 0), (len(rows), 1)), linear.move_factor),
+    ):
+        np.testing.assert_allclose(moves[which, rows].transpose(0, 2, 1), found, rtol=1e-5, atol=1e-4)
+    rows = np.arange(len(linear.roof))[:, None]
+    found = np.concatenate([linear.roof_by_stop, linear.roof_by_plane], axis=2)
+    np.testing.assert_allclose(roofs[adjustment.roof_entries, rows].transpose(0, 2, 1), found, rtol=1e-5, atol=1e-4)
 
 
 @settings(max_examples=25, deadline=None)

@@ -193,6 +193,8 @@ MISTAKES = [
     (["known_labels", 0, "sigma_m"], 0, ["known_labels[0].sigma_m: found 0"]),
     (["known_labels"], EXAMPLE["known_labels"] * 2, ["known_labels: label 'A17' is given 2 times"]),
     (["roof_cameras", 0, "H_world_image", 2], [0, 0, 0], ["roof_cameras[0].H_world_image: is singular"]),
+    (["roof_cameras", 0, "covariance"], [[1.0]], ["roof_cameras[0].covariance: expected 9 rows of 9"]),
+    (["roof_cameras", 0, "covariance"], [[-1.0] * 9] * 9, ["roof_cameras[0].covariance: is not positive semi"]),
     (["stops", 0, "move"], EXAMPLE["stops"][1]["move"], ["stops[0].move: is the first stop of leg 1; expected null"]),
     (["stops", 1, "move"], None, ["stops[1].move: found null"]),
     (["stops", 1, "stop"], 1, ["stops[1].stop: leg 1 has stop 1 twice"]),

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from robotd.geometry.homography import apply, fit
 from robotd.geometry.transforms import (
+    heading_matrix,
     pose_matrix,
     se2_compose,
 )
@@ -17,9 +19,21 @@ from robotd.records import (
     RoofCamera,
 )
 from robotd.solver import evaluate, solve
-from robotd.solver.bundle import Adjustment, Loss
+from robotd.solver.bundle import Adjustment, Loss, travelled
 from robotd.solver.problem import State, build_problem
-from tests.store_surveys import in_legs, label_of, noisy_room, quiet_room, with_sightings
+from robotd.solver.robust import optimise
+from tests.store_surveys import (
+    World,
+    in_legs,
+    label_of,
+    load,
+    nees,
+    noisy_room,
+    quiet_room,
+    simulate,
+    true_poses,
+    with_sightings,
+)
 
 
 def test_what_has_no_prior_is_held_fixed_exactly():
@@ -125,3 +139,74 @@ def test_a_leg_that_shares_no_label_is_reported_not_guessed():
     assert any("leg/stop 2/1, 2/2, 2/3" in note for note in result.notes)
     assert {m.status for m in result.labels if m.label.endswith("x")} == {"unplaced"}
     assert evaluate(result, truth).error_mm["max"] < 0.01
+
+
+PLANE = np.array([[100.0, 4.0, 640.0], [-3.0, 100.0, 360.0], [0.01, 0.02, 1.0]])  # world to pixels
+
+
+def from_the_roof(survey, seed, beacon_m=0.01, picked_px=0.5):
+    """The survey seen by one roof camera that was calibrated from eight points, and whose beacons were taped."""
+    rng = np.random.default_rng([seed, 5])
+    points = rng.uniform([-2.0, -2.0], [3.0, 3.0], (8, 2))
+    picked = apply(PLANE, points) + rng.normal(0.0, picked_px, (8, 2))
+    believed = fit(points, picked, picked_px).homography
+    H = np.linalg.inv(believed.matrix)
+    roof = RoofCamera("roof-1", (1280, 720), tuple(map(tuple, H.tolist())), tuple(map(tuple, believed.covariance)))
+    store = load("room")
+    stops = []
+    for stop, pose in zip(survey.stops, true_poses(store), strict=True):
+        seen = []
+        for beacon, place in survey.rig.beacons.items():
+            at = (pose_matrix(*pose) @ [*place, 1.0])[:2]
+            u, v = (apply(PLANE, at[None])[0] + rng.normal(0.0, 0.05, 2)).tolist()
+            seen.append(BeaconSighting("roof-1", beacon, u, v, 0.05))
+        stops.append(replace(stop, beacon_sightings=tuple(seen)))
+    taped = {
+        name: (x + rng.normal(0.0, beacon_m), y + rng.normal(0.0, beacon_m), z)
+        for name, (x, y, z) in survey.rig.beacons.items()
+    }
+    return replace(
+        survey,
+        stops=tuple(stops),
+        roof_cameras=(roof,),
+        rig=replace(survey.rig, beacons=taped),
+        priors=replace(survey.priors, beacon_m=beacon_m),
+    )
+
+
+def test_homographies_and_beacons_are_refined_within_their_priors():
+    world = World(reflections=0.0, wrong_ids=0.0, slip=0.0, tilt=0.0)
+    refined, believed = [], []
+    for seed in range(5):
+        survey, truth = simulate(load("room"), seed, world)
+        seen = from_the_roof(survey, seed)
+        exact = replace(
+            seen,
+            priors=replace(seen.priors, beacon_m=0.0),
+            roof_cameras=tuple(replace(roof, covariance=None) for roof in seen.roof_cameras),
+        )
+        refined += nees(solve(seen), truth)
+        believed += nees(solve(exact), truth)
+    assert 0.5 < np.mean(refined) < 2.0
+    assert np.mean(believed) > 10.0  # who believes them is too sure
+
+
+def test_wheels_of_unequal_size_are_found_within_their_prior():
+    survey, truth = simulate(load("warehouse"), 3, World(reflections=0.0, wrong_ids=0.0, slip=0.0))
+    drift = 0.03
+
+    def drifted(stop):
+        if stop.move is None:
+            return stop
+        move = stop.move
+        way = travelled(np.array([[move.dx, move.dy, move.dheading]]))[0]
+        x, y = heading_matrix(-0.5 * drift * way) @ [move.dx, move.dy]
+        return replace(stop, move=replace(move, dx=x, dy=y, dheading=move.dheading - drift * way))
+
+    worn = replace(survey, stops=tuple(map(drifted, survey.stops)))
+    allowed = replace(worn, priors=replace(worn.priors, odometry_drift=0.03))
+    as_made = evaluate(solve(survey), truth).error_mm["mean"]
+    assert evaluate(solve(allowed), truth).error_mm["mean"] == pytest.approx(as_made, abs=2.0)
+    problem = build_problem(allowed)
+    assert optimise(problem).state.frame[-1] == pytest.approx(drift, abs=0.012)
+    assert optimise(build_problem(worn)).state.frame[-1] == 0.0

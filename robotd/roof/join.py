@@ -80,16 +80,15 @@ def join(
     for stop, date in zip(stops, dates, strict=True):
         found, seen = [], []
         for dwell in _covering(known, float(date) + offset):
-            calibration = calibrations[dwell.calibration]
             spread = np.array([[dwell.uu, dwell.uv], [dwell.uv, dwell.vv]])
             flat = lenses[dwell.calibration].undistort(np.array([dwell.u, dwell.v]), spread)
             if flat is None:
                 continue
             pixel, spread = flat
             seen.append(Seen(names[dwell.calibration], dwell.beacon, pixel, spread))
-            # the survey has one sigma a sighting, so it takes in what the camera's calibration leaves open
-            open_ = calibration.homography.pixel_spread(apply(calibration.homography.inverse, pixel[None]))[0]
-            sigma = float(np.sqrt(0.5 * np.trace(spread + open_)))
+            sigma = float(
+                np.sqrt(0.5 * np.trace(spread))
+            )  # what the calibration leaves open is the camera's covariance
             u, v = float(pixel[0]), float(pixel[1])
             found.append(BeaconSighting(names[dwell.calibration], dwell.beacon, u, v, sigma))
         if found:
@@ -100,7 +99,7 @@ def join(
                 poses[stop.leg, stop.stop] = pose
     used = {sighting.roof_camera for group in sightings.values() for sighting in group}
     cameras = tuple(
-        RoofCamera(name, calibrations[digest].size, calibrations[digest].H_world_image)
+        RoofCamera(name, calibrations[digest].size, calibrations[digest].H_world_image, calibrations[digest].covariance)
         for digest, name in sorted(names.items(), key=lambda item: item[1])
         if name in used
     )

@@ -153,6 +153,7 @@ class World:
                 centre_px=s.centre_error,
                 odometry_scale=s.wheel_scale_error,
                 odometry_turn=math.hypot(s.wheel_scale_error, s.wheel_base_error),
+                beacon_m=s.roof.beacon_error if self.layout.roof_cameras else 0.0,
             ),
         )
 

@@ -19,7 +19,7 @@ from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
 from .mapping import to_map
 from .placement import segments
-from .problem import CAMERA, STOP, Ints, Problem, State, anchors, build_problem
+from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Ints, Problem, State, anchors, build_problem
 from .robust import SLIPPED, Optimum, optimise
 
 JOINING = 3  # shared labels that join two parts of a survey, as in placement
@@ -299,7 +299,7 @@ def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:
         [
             STOP * m.before[:, None] + np.arange(3),
             STOP * m.after[:, None] + np.arange(3),
-            np.tile(len(frame) + np.arange(-2, 0), (len(m.before), 1)),
+            np.tile(len(frame) + np.arange(-ODOMETRY, 0), (len(m.before), 1)),
         ],
         axis=1,
     )
@@ -312,8 +312,8 @@ def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:
         squares = float((linear.move[wheels][good] ** 2).sum())
         result.append(Scatter("odometry (heading)", stated, "rad", squares, float((3.0 - fitted[good]).sum())))
     if len(linear.roof):
-        entries = STOP * problem.roofs.stop[:, None] + np.arange(STOP)
-        B = linear.roof_by_stop
+        entries = adjustment.roof_entries
+        B = np.concatenate([linear.roof_by_stop, linear.roof_by_plane], axis=2)
         fitted = np.einsum("mri,mij,mrj->m", B, frame[entries[:, :, None], entries[:, None, :]], B)
         stated = float(np.sqrt(np.mean(problem.roofs.sigma**2)))
         left = float((2.0 - fitted).sum())
@@ -333,11 +333,15 @@ def _priors(problem: Problem) -> list[tuple[str, str, Ints]]:
     """Kinds of priors: name, unit and frame entries."""
     stops = STOP * np.arange(problem.stop_count)[:, None]
     cameras = STOP * problem.stop_count + CAMERA * np.arange(len(problem.cameras))[:, None]
+    planes = problem.roof_entry + ROOF * np.arange(len(problem.roof_axes))[:, None]
+    beacons = problem.beacon_entry + BEACON * np.arange(len(problem.survey.rig.beacons))[:, None]
     kinds: list[tuple[str, str, Ints, list[int]]] = [
         ("tilt of the floor", "rad", stops, [3, 4]),
         ("mounting of the cameras, rotation", "rad", cameras, [0, 1, 2]),
         ("mounting of the cameras, position", "m", cameras, [3, 4, 5]),
         ("lens", "px", cameras, [6, 7, 8, 9]),
+        ("homographies of the roof cameras", "sigma", planes, [*range(ROOF)]),
+        ("places of the beacons", "m", beacons, [*range(BEACON)]),
     ]
     return [(name, unit, (first + np.array(which, dtype=np.int64)).ravel()) for name, unit, first, which in kinds]
 

@@ -17,7 +17,7 @@ import scipy.sparse
 
 from ..geometry.transforms import heading_matrix, invert_rigid, pose_matrix, se2_relative, transform_points
 from ..records import Floats
-from .bundle import SQUARE, Adjustment
+from .bundle import SQUARE, Adjustment, travelled
 from .covariance import inverse
 from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Known, Moves, Problem, Sightings, State
 from .robust import Optimum
@@ -191,6 +191,8 @@ class Belief:
         by_before[0, 2], by_before[1, 2] = measured[1], -measured[0]
         factor = np.zeros((3, ODOMETRY))
         factor[:2, 0], factor[2, 1] = -measured[:2], -measured[2]
+        way = travelled(measured[None])[0]
+        factor[:, 2] = 0.5 * way * measured[1], -0.5 * way * measured[0], -way
         root = np.linalg.inv(np.linalg.cholesky(covariance))
         entries = np.concatenate([at, entry + np.arange(3), self._columns[-ODOMETRY:]])
         return Rows(root @ np.concatenate([by_before, by_after, factor], axis=1), np.tile(entries, (3, 1)))

@@ -19,7 +19,7 @@ import scipy.sparse
 from ..geometry.transforms import heading_matrix, pose_matrix, rotation_matrix, skew, wrap_angle
 from ..records import Floats
 from .kernel import SHAPES, compiled
-from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Problem, Sightings, State
+from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Bools, Ints, Problem, Sightings, State
 
 if TYPE_CHECKING:
     from ._bundle import Bundle
@@ -62,7 +62,8 @@ class Linear:
 
     Sightings: `residual` (N, 2), `by_frame` (N, 2, 15) by the stop's 5 and the camera's 10 entries, `by_point`
     (N, 2, 3), `valid` (N,). Moves, then motions: `move` (M, 3), its derivatives (M, 3, 3) by x, y, heading of the stops
-    before and after, and (M, 3, 2) by the odometry factors. Beacons: `roof` (B, 2), `roof_by_stop` (B, 2, 5).
+    before and after, and (M, 3, 3) by the odometry factors. Beacons: `roof` (B, 2), `roof_by_stop` (B, 2, 5), and
+    `roof_by_plane` (B, 2, 10) by the entries of its camera's homography and of its beacon.
     """
 
     residual: Floats
@@ -75,6 +76,7 @@ class Linear:
     move_factor: Floats
     roof: Floats
     roof_by_stop: Floats
+    roof_by_plane: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,6 +137,7 @@ class Adjustment:
         self.after: Ints = np.concatenate([moves.after, motions.after])
         self.measured: Floats = np.concatenate([moves.measured, motions.measured])
         self.move_roots: Floats = np.concatenate([np.linalg.inv(np.linalg.cholesky(moves.covariance)), motions.root])
+        self.travelled: Floats = travelled(self.measured)
         self.by_wheels: Floats = np.repeat([1.0, 0.0], [len(moves.before), len(motions.before)])
         self.known_here: Ints = np.flatnonzero(seen[problem.known.label])
         self.known_point: Ints = np.searchsorted(self.labels, problem.known.label[self.known_here])
@@ -153,6 +156,17 @@ class Adjustment:
         )
 
     @cached_property
+    def roof_entries(self) -> Ints:
+        """(B, 15) frame entries that each roof sighting depends on: its stop's, its camera's and its beacon's."""
+        problem, roofs = self.problem, self.problem.roofs
+        parts = (
+            STOP * roofs.stop[:, None] + np.arange(STOP),
+            problem.roof_entry + ROOF * roofs.camera[:, None] + np.arange(ROOF),
+            problem.beacon_entry + BEACON * roofs.which[:, None] + np.arange(BEACON),
+        )
+        return np.concatenate(parts, axis=1)
+
+    @cached_property
     def _pattern(self) -> tuple[Bools, Ints, Ints]:
         """Which of the (N, 2, 15) derivatives have a column, and the CSR indices of what remains."""
         columns = np.repeat(self.columns[self.entries][:, None], 2, axis=1)
@@ -169,7 +183,9 @@ class Adjustment:
         roofs = self.problem.roofs.stop
         R_stop = np.zeros((len(poses), 3, 3))
         R_stop[roofs] = pose_matrix(*poses[roofs].T)[:, :3, :3]
-        return Residuals(residual, valid, self._linear_moves(poses, state)[0], self._linear_roofs(poses, R_stop)[0])
+        return Residuals(
+            residual, valid, self._linear_moves(poses, state)[0], self._linear_roofs(poses, R_stop, state)[0]
+        )
 
     def linearise(self, state: State, loss: Loss) -> Linear:
         """Residuals and analytic derivatives at a state."""
@@ -222,7 +238,12 @@ class Adjustment:
         frame[:, :, 8:11] = -by_robot_point
         frame[:, :, 11:15] = np.where(valid[:, None, None], by_lens, 0.0) / sigma[:, None, None]
         return Linear(
-            residual, frame, by_point, valid, *self._linear_moves(poses, state), *self._linear_roofs(poses, R_stop)
+            residual,
+            frame,
+            by_point,
+            valid,
+            *self._linear_moves(poses, state),
+            *self._linear_roofs(poses, R_stop, state),
         )
 
     def _linear_moves(self, poses: Floats, state: State) -> tuple[Floats, Floats, Floats, Floats]:
@@ -232,10 +253,12 @@ class Adjustment:
         a, b = poses[self.before, :3], poses[self.after, :3]
         R_a_world = heading_matrix(a[:, 2]).transpose(0, 2, 1)
         shift = (R_a_world @ (b - a)[:, :2, None])[:, :, 0]
-        scale, turn = self.by_wheels * state.frame[-ODOMETRY:, None]
+        scale, turn, drift = self.by_wheels * state.frame[-ODOMETRY:, None]
+        # a drift bends the way, whose end lies half of the whole turn aside
+        aside = 0.5 * self.travelled[:, None] * measured[:, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
         residual = np.empty((len(a), 3))
-        residual[:, :2] = shift - (1.0 + scale[:, None]) * measured[:, :2]
-        residual[:, 2] = wrap_angle(b[:, 2] - a[:, 2] - measured[:, 2]) - turn * measured[:, 2]
+        residual[:, :2] = shift - (1.0 + scale[:, None]) * measured[:, :2] - drift[:, None] * aside
+        residual[:, 2] = wrap_angle(b[:, 2] - a[:, 2] - measured[:, 2]) - turn * measured[:, 2] - drift * self.travelled
         after = np.zeros((len(a), 3, 3))
         after[:, :2, :2], after[:, 2, 2] = R_a_world, 1.0
         before = -after
@@ -243,28 +266,40 @@ class Adjustment:
         factor = np.zeros((len(a), 3, ODOMETRY))
         factor[:, :2, 0] = -self.by_wheels[:, None] * measured[:, :2]
         factor[:, 2, 1] = -self.by_wheels * measured[:, 2]
+        factor[:, :2, 2] = -self.by_wheels[:, None] * aside
+        factor[:, 2, 2] = -self.by_wheels * self.travelled
         L = self.move_roots
         return (L @ residual[:, :, None])[:, :, 0], L @ before, L @ after, L @ factor
 
-    def _linear_roofs(self, poses: Floats, R_stop: Floats) -> tuple[Floats, Floats]:
-        roofs = self.problem.roofs
-        R = R_stop[roofs.stop]
-        arm = (R @ roofs.beacon[:, :, None])[:, :, 0]
+    def _linear_roofs(self, poses: Floats, R_stop: Floats, state: State) -> tuple[Floats, Floats, Floats]:
+        problem, roofs = self.problem, self.problem.roofs
+        if len(roofs.stop) == 0:
+            return np.zeros((0, 2)), np.zeros((0, 2, STOP)), np.zeros((0, 2, ROOF + BEACON))
+        R, own = R_stop[roofs.stop], problem.roof_axes[roofs.camera]
+        planes = state.frame[problem.roof_entry : problem.beacon_entry].reshape(-1, ROOF)[roofs.camera]
+        shifts = state.frame[problem.beacon_entry : -ODOMETRY].reshape(-1, BEACON)[roofs.which]
+        H = roofs.H_image_world + np.einsum("bk,bkij->bij", planes, own)
+        beacon = roofs.beacon + np.column_stack([shifts, np.zeros(len(shifts))])
+        arm = (R @ beacon[:, :, None])[:, :, 0]
         world = poses[roofs.stop, :2] + arm[:, :2]
-        h = (roofs.H_image_world @ np.column_stack([world, np.ones(len(world))])[:, :, None])[:, :, 0]
+        at = np.column_stack([world, np.ones(len(world))])
+        h = (H @ at[:, :, None])[:, :, 0]
         pixels = h[:, :2] / h[:, 2:]
-        by_world = (roofs.H_image_world[:, :2, :2] - pixels[:, :, None] * roofs.H_image_world[:, 2:, :2]) / h[
-            :, 2:, None
-        ]
+        by_world = (H[:, :2, :2] - pixels[:, :, None] * H[:, 2:, :2]) / h[:, 2:, None]
+        step = np.einsum("bkij,bj->bik", own, at)
+        by_plane = np.empty((len(world), 2, ROOF + BEACON))
+        by_plane[:, :, :ROOF] = (step[:, :2] - pixels[:, :, None] * step[:, 2:]) / h[:, 2:, None]
+        by_plane[:, :, ROOF:] = by_world @ R[:, :2, :2]
         by_stop = np.zeros((len(world), 2, STOP))
         by_stop[:, :, :2] = by_world
         by_stop[:, :, 2] = by_world[:, :, 0] * -arm[:, 1:2] + by_world[:, :, 1] * arm[:, 0:1]
         roll = poses[roofs.stop, 3]
         pitch_axis = np.column_stack([np.zeros(len(roll)), np.cos(roll), -np.sin(roll)])
-        by_rotation = -(R @ skew(roofs.beacon))[:, :2]
+        by_rotation = -(R @ skew(beacon))[:, :2]
         by_stop[:, :, 3] = (by_world @ by_rotation[:, :, :1])[:, :, 0]
         by_stop[:, :, 4] = (by_world @ by_rotation @ pitch_axis[:, :, None])[:, :, 0]
-        return (pixels - roofs.uv) / roofs.sigma[:, None], by_stop / roofs.sigma[:, None, None]
+        sigma = roofs.sigma[:, None]
+        return (pixels - roofs.uv) / sigma, by_stop / sigma[:, None], by_plane / sigma[:, None]
 
     def _known_residual(self, state: State) -> Floats:
         known, here = self.problem.known, self.known_here
@@ -328,8 +363,8 @@ class Adjustment:
         if len(linear.roof) == 0:
             return
         _, weight = _cauchy((linear.roof**2).sum(axis=1), loss.move_width)
-        J = linear.roof_by_stop
-        entries = STOP * self.problem.roofs.stop[:, None] + np.arange(STOP)
+        J = np.concatenate([linear.roof_by_stop, linear.roof_by_plane], axis=2)
+        entries = self.roof_entries
         self._add(H, gradient, entries, J * weight[:, None, None], J, linear.roof)
 
     def _add(self, H: Floats, gradient: Floats, entries: Ints, weighted: Floats, J: Floats, residual: Floats) -> None:
@@ -449,6 +484,12 @@ class Adjustment:
         frame[self.problem.free] += frame_step
         points[self.labels] += point_step
         return replace(state, frame=frame, points=points)
+
+
+def travelled(moves: Floats) -> Floats:
+    """(M,) metres of way that moves (M, 3) took, if it was an arc."""
+    half = 0.5 * moves[:, 2]
+    return np.asarray(np.hypot(moves[:, 0], moves[:, 1]) / np.sinc(half / np.pi))
 
 
 def _cauchy(square: Floats, width: float) -> tuple[Floats, Floats]:

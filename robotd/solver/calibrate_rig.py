@@ -18,7 +18,7 @@ from ..geometry.transforms import rotation_matrix, rotation_vector, transform_re
 from ..records import CameraModel, Floats, Matrix3, Priors, Rig, Sighting, Survey, Vector3
 from ..typed_json import many_records
 from .bundle import SQUARE
-from .problem import Problem, build_problem, stops_per_label
+from .problem import ODOMETRY, Problem, build_problem, stops_per_label
 from .rig_fit import Joint, Mode, amount, joint, relative_sigma, with_nominal
 from .rig_roofs import RoofUnknowns
 from .robust import Optimum, optimise
@@ -264,8 +264,12 @@ def _loosened(survey: Survey, bounds: Bounds) -> Survey:
         camera_translation_m=bounds.each[1],
         odometry_scale=_FREE_ODOMETRY if metric else given.odometry_scale or _ODOMETRY,
         odometry_turn=_FREE_ODOMETRY,
+        beacon_m=0.0,
     )
-    return replace(survey, priors=priors)
+    exact = tuple(
+        replace(roof, covariance=None) for roof in survey.roof_cameras
+    )  # `joint` has its own unknowns for them
+    return replace(survey, priors=priors, roof_cameras=exact)
 
 
 def _at(survey: Survey, found: Joint) -> Survey:
@@ -409,7 +413,7 @@ def _result(
                 residual[mine],
             )
         )
-    beacons, sigmas, distance = _beacons(problem, found, 6 * len(models) + 2)
+    beacons, sigmas, distance = _beacons(problem, found, 6 * len(models) + ODOMETRY)
     scale, turns = (
         _factor(found.odometry[k], variance[6 * len(models) + k], prior)
         for k, prior in enumerate((asked.survey.priors.odometry_scale, asked.survey.priors.odometry_turn))

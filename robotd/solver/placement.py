@@ -9,7 +9,7 @@ import numpy as np
 from ..geometry.transforms import heading_matrix, se2_compose, se2_inverse
 from ..records import Floats
 from .initial import chain, locate, triangulate, world_rays
-from .problem import STOP, Bools, Ints, Known, Problem, State
+from .problem import ODOMETRY, STOP, Bools, Ints, Known, Problem, State
 
 _LABELS_TO_JOIN = 3  # shared labels that must agree before two runs of odometry are joined
 
@@ -183,7 +183,7 @@ def detach(problem: Problem, placed: Bools) -> Problem:
 def at_first_stop(problem: Problem, note: str) -> Problem:
     """The problem with its world frame fixed by the first stop, after its outside references proved useless."""
     prior = problem.prior_sigma.copy()
-    prior[:3] = 0.0
+    prior[:3] = prior[problem.roof_entry : -ODOMETRY] = 0.0
     nothing = Known(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     roofs = problem.roofs.select(np.zeros(len(problem.roofs.stop), dtype=np.bool_))
     return replace(

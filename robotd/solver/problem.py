@@ -4,7 +4,9 @@ The unknowns are a frame vector and the label points. The frame vector holds, in
 
     5 per stop      x, y, heading, roll, pitch
     10 per camera   corrections: rotation vector (3) and translation (3) in camera-to-robot, fx, fy, cx, cy
-    2               relative errors of all odometry: scale (dx, dy) and turn (dheading)
+    8 per roof      homography of a roof camera, along the principal axes of its covariance, in standard deviations
+    2 per beacon    shift of its x, y in robot axes
+    3               errors of all odometry: scale (dx, dy) and turn (dheading), relative, and drift, radians per metre
 
 Entries whose prior is zero, and the first stop's planar pose when nothing outside fixes the world frame, are held
 fixed: they have no column in the normal equations, so that a planar problem costs what a planar problem costs.
@@ -22,12 +24,12 @@ from ..errors import InputError, SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
 from ..records import Floats, Matrix3, Survey
-from ..survey_checks import Problems, check_units
+from ..survey_checks import Problems, check_roof, check_units
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-STOP, CAMERA, ODOMETRY = 5, 10, 2  # entries of the frame vector per stop, per camera, and for all odometry
+STOP, CAMERA, ROOF, BEACON, ODOMETRY = 5, 10, 8, 2, 3  # entries of the frame vector: see above
 SIGMA_FLOOR_PX = 0.05  # to judge which sightings fit: what lenses leave, whatever a detector says of its centroid
 BEACON_SPREAD_M = 0.05  # beacons nearer together than this do not show a heading
 COVARIANCE_FLOOR = np.diag([1e-4, 1e-4, 1e-4]) ** 2  # keeps a move that was reported as exact invertible
@@ -97,10 +99,13 @@ class Motions:
 class Roofs:
     """Beacons seen by roof cameras: `stop` (B,), `beacon` (B, 3) in robot axes, `uv` (B, 2) and `sigma` (B,) in px.
 
-    `H_image_world` (B, 3, 3) takes world x, y in the beacons' plane to the roof camera's pixels.
+    `H_image_world` (B, 3, 3) takes world x, y in the beacons' plane to the roof camera's pixels. `camera` and `which`
+    (B,) number the survey's roof cameras and the rig's beacons.
     """
 
     stop: Ints
+    camera: Ints
+    which: Ints
     beacon: Floats
     uv: Floats
     sigma: Floats
@@ -170,6 +175,7 @@ class Problem:
 
     `prior_sigma` (F,) holds the standard deviations of the frame entries around zero: 0 = held fixed, infinite = free.
     `leg` (S,) is the leg of each stop, `odometry` (S, 3) its dead-reckoned pose in the leg's own frame.
+    `roof_axes` (R, 8, 3, 3) are the steps of each roof camera's homography, world to pixels, by its entries.
     `frame` says what fixes the world frame: "first stop", "known labels" or "roof cameras".
     """
 
@@ -183,6 +189,7 @@ class Problem:
     moves: Moves
     motions: Motions
     roofs: Roofs
+    roof_axes: Floats
     known: Known
     leg: Ints
     odometry: Floats
@@ -205,7 +212,17 @@ class Problem:
 
     def camera_entries(self, state: State) -> Floats:
         """(C, 10) corrections of the cameras."""
-        return state.frame[STOP * self.stop_count : -ODOMETRY].reshape(-1, CAMERA)
+        return state.frame[STOP * self.stop_count : self.roof_entry].reshape(-1, CAMERA)
+
+    @property
+    def roof_entry(self) -> int:
+        """Where the roof cameras' entries begin."""
+        return STOP * self.stop_count + CAMERA * len(self.cameras)
+
+    @property
+    def beacon_entry(self) -> int:
+        """Where the beacons' entries begin."""
+        return self.roof_entry + ROOF * len(self.roof_axes)
 
 
 def build_problem(survey: Survey) -> Problem:
@@ -227,7 +244,7 @@ def build_problem(survey: Survey) -> Problem:
     sightings, notes = _sightings(columns, cameras, labels)
     moves, gaps = _moves(survey)
     known = _known(survey, labels)
-    roofs = _roofs(survey)
+    roofs, axes = _roofs(survey)
     frame = "first stop"
     if len(roofs.stop) >= 2 and np.ptp(np.column_stack([roofs.stop, roofs.beacon]), axis=0).max() > BEACON_SPREAD_M:
         frame = "roof cameras"
@@ -247,10 +264,11 @@ def build_problem(survey: Survey) -> Problem:
         moves=moves,
         motions=_motions(survey),
         roofs=roofs,
+        roof_axes=axes,
         known=known,
         leg=np.array([stop.leg for stop in survey.stops]),
         odometry=np.array([pose_array(stop.odometry) for stop in survey.stops]),
-        prior_sigma=_prior_sigma(survey, fixed_first=frame == "first stop"),
+        prior_sigma=_prior_sigma(survey, roofs, axes, fixed_first=frame == "first stop"),
         frame=frame,
         notes=(*notes, *gaps),
     )
@@ -274,6 +292,8 @@ def _check(survey: Survey) -> Columns:
     for roof in survey.roof_cameras:
         if not (np.isfinite(H := np.array(roof.H_world_image)).all() and abs(np.linalg.det(H)) > 1e-12):
             problems.append(f"{where}: roof camera {roof.name}: H_world_image is not invertible")
+    for number, roof in enumerate(survey.roof_cameras):
+        check_roof(roof, f"roof_cameras[{number}]", doubts)
     for known in survey.known_labels:
         if not np.isfinite([*known.position, known.sigma_m]).all():
             problems.append(f"{where}: known label {known.label}: position and sigma_m must be finite, got {known}")
@@ -401,17 +421,31 @@ def _motions(survey: Survey) -> Motions:
     )
 
 
-def _roofs(survey: Survey) -> Roofs:
+def _roofs(survey: Survey) -> tuple[Roofs, Floats]:
     inverse = {roof.name: np.linalg.inv(np.array(roof.H_world_image)) for roof in survey.roof_cameras}
     rows = [(f, b) for f, stop in enumerate(survey.stops) for b in stop.beacon_sightings]
     default = survey.sigmas.roof_px if survey.sigmas.roof_px > 0.0 else 1.0
-    return Roofs(
+    cameras, beacons = list(inverse), list(survey.rig.beacons)
+    axes = np.array([_roof_axes(inverse[r.name], r.covariance) for r in survey.roof_cameras]).reshape(-1, ROOF, 3, 3)
+    roofs = Roofs(
         stop=np.array([f for f, _ in rows], dtype=np.int64),
+        camera=np.array([cameras.index(b.roof_camera) for _, b in rows], dtype=np.int64),
+        which=np.array([beacons.index(b.beacon) for _, b in rows], dtype=np.int64),
         beacon=np.array([survey.rig.beacons[b.beacon] for _, b in rows]).reshape(-1, 3),
         uv=np.array([[b.u, b.v] for _, b in rows]).reshape(-1, 2),
         sigma=np.array([default if b.sigma_px is None else b.sigma_px for _, b in rows]),
         H_image_world=np.array([inverse[b.roof_camera] for _, b in rows]).reshape(-1, 3, 3),
     )
+    return roofs, axes
+
+
+def _roof_axes(H: Floats, covariance: tuple[tuple[float, ...], ...] | None) -> Floats:
+    """(8, 3, 3) steps of one standard deviation along a homography's principal axes; 0 where it is exact."""
+    if covariance is None:
+        return np.zeros((ROOF, 3, 3))
+    values, vectors = np.linalg.eigh(np.array(covariance))  # the least of nine is the scale, which says nothing
+    values = np.where(values > 1e-9 * values[-1], values, 0.0)[-ROOF:]
+    return np.asarray((np.linalg.norm(H) * np.sqrt(values) * vectors[:, -ROOF:]).T.reshape(ROOF, 3, 3))
 
 
 def _known(survey: Survey, labels: list[str]) -> Known:
@@ -436,11 +470,16 @@ def anchors(known: Known, sightings: Sightings) -> bool:
     return len(seen) >= 2 and bool(np.ptp(seen[:, :2], axis=0).max() > 0.1)
 
 
-def _prior_sigma(survey: Survey, fixed_first: bool) -> Floats:
+def _prior_sigma(survey: Survey, roofs: Roofs, axes: Floats, fixed_first: bool) -> Floats:
     p = survey.priors
     stops = np.tile([np.inf, np.inf, np.inf, p.tilt_rad, p.tilt_rad], (len(survey.stops), 1))
     if fixed_first:
         stops[0, :3] = 0.0
     one = [p.camera_rotation_rad] * 3 + [p.camera_translation_m] * 3 + [p.focal_px] * 2 + [p.centre_px] * 2
     cameras = np.tile(one, len(survey.rig.cameras))
-    return np.concatenate([stops.ravel(), cameras, [p.odometry_scale, p.odometry_turn]])
+    watches = np.isin(np.arange(len(axes)), roofs.camera)  # homographies and beacons that nothing shows stay exact
+    seen = np.isin(np.arange(len(survey.rig.beacons)), roofs.which)
+    plane = np.where(watches[:, None] & axes.any(axis=(2, 3)), 1.0, 0.0)
+    beacons = np.repeat(np.where(seen, p.beacon_m, 0.0), BEACON)
+    odometry = [p.odometry_scale, p.odometry_turn, p.odometry_drift]
+    return np.concatenate([stops.ravel(), cameras, plane.ravel(), beacons, odometry])

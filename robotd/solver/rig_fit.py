@@ -36,11 +36,11 @@ class Joint:
         Camera to robot axes.
     translation : (C, 3) array
         Of the cameras' centres in robot axes, metres.
-    odometry : (2,) array
-        Relative errors of all moves: scale (dx, dy) and turn (dheading).
+    odometry : (3,) array
+        Errors of all moves: scale (dx, dy) and turn (dheading), relative, and drift in radians per metre.
     beacons : (B, 3) array
         Robot axes, metres; heights are as given.
-    covariance : (6 C + 2 + 2 B,) square array
+    covariance : (6 C + 3 + 2 B,) square array
         Of each camera's rotation (radians about robot axes) and translation, then odometry, then the beacons' x, y.
     """
 
@@ -115,7 +115,7 @@ def joint(optimum: Optimum, sigmas: tuple[float, float]) -> tuple[Joint, Optimum
     column = np.full(len(problem.prior_sigma) + extra, -1)
     column[np.append(problem.free, np.ones(extra, dtype=np.bool_))] = np.arange(len(H))
     rig = (base + CAMERA * np.arange(cameras)[:, None] + np.arange(6)).ravel()
-    factors = base + CAMERA * cameras + np.arange(ODOMETRY)
+    factors = len(problem.prior_sigma) + np.arange(-ODOMETRY, 0)
     wanted = column[np.concatenate([rig, factors, len(problem.prior_sigma) + np.arange(2 * len(unknowns.given))])]
     covariance, full = np.zeros((len(wanted), len(wanted))), _inverse(H)
     there = wanted >= 0

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from robotd.geometry.transforms import se2_compose, se2_inverse, wrap_angle
+from robotd.geometry.transforms import wrap_angle
 from robotd.records import Pose
 from robotd.solver import solve
 from robotd.solver.bundle import SQUARE, Adjustment
 from robotd.solver.covariance import covariance
 from robotd.solver.problem import STOP, State, build_problem
-from tests.store_surveys import World, load, path_of, simulate
+from tests.store_surveys import World, load, simulate, true_poses
 
 SEEDS = 100
 STORES = ("room", "warehouse")
@@ -29,15 +29,6 @@ COARSE = replace(WORLD, tilt=0.0, rig_rotation=0.0, rig_translation=0.0, lens_px
 THESIS_NOISE = (0.2, 0.2, np.pi / 20)  # m, m, rad of every stop's start
 CHI_SQUARE_95 = 7.8147  # with 3 degrees of freedom
 LEAST_VIEWS, LEAST_STOPS, LEAST_PARALLAX = 3, 2, np.radians(10.0)
-
-
-def true_poses(store):
-    """(S, 3) of the stops, in the axes of the first."""
-    poses, arc = path_of(store["line"])
-    poses = poses[[int(np.argmin(np.abs(arc - a))) for a in store["line"]["stops"]]]
-    poses = se2_compose(se2_inverse(poses[0]), poses)
-    poses[:, 2] = wrap_angle(poses[:, 2])
-    return poses
 
 
 def noisy_start(survey, seed):
