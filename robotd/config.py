@@ -7,9 +7,7 @@ before any device is opened.
 from __future__ import annotations
 
 import math
-import os
 import re
-import shutil
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +17,7 @@ from typing import Any, Literal, TypeVar
 
 from .bind import bind, ranged
 from .errors import ConfigError, InputError
+from .files import write_atomic
 from .identify import IdentifyConfig
 from .odometry import Wheels
 from .records import CameraModel, KnownLabel, Priors, Rig, Sigmas, Vector3
@@ -265,7 +264,7 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
         lines += ["", "[[cameras]]", *_lines(camera)]
     if calibration.floor_camera is not None:
         lines += ["", "[floor_camera]", *_lines(calibration.floor_camera)]
-    _replace(path, "\n".join(lines) + "\n")
+    write_atomic(path, ("\n".join(lines) + "\n").encode())
 
 
 def save_wheels(wheels: Wheels, path: Path, note: str | None = None) -> None:
@@ -274,36 +273,28 @@ def save_wheels(wheels: Wheels, path: Path, note: str | None = None) -> None:
     `note` is added as a comment behind the file's other lines about wheels. Replaces the file atomically. Raises
     ConfigError if the file cannot be read, or its wheels cannot be edited.
     """
-    text = ""
-    if path.exists():
-        read_toml(path)
-        text = path.read_text(encoding="utf-8")
+    text = _text(path)
     text = replace_table(text, "wheels", assignments(wheels), str(path))
     if note is not None:
         lines = text.splitlines()
         header = next(k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[wheels]"))
         text = "\n".join([*lines[: header + 1], f"# {note}", *lines[header + 1 :]]) + "\n"
-    bind(Calibration, tomllib.loads(text), str(path))
-    _replace(path, text)
+    _save(path, text)
 
 
 def save_floor_camera(camera: CameraModel, path: Path, note: str) -> None:
     """Write [floor_camera] into calibration.toml, under a comment with `note`; all else in the file stays as it was.
 
-    The file need not exist and is replaced atomically. Raises ConfigError if it cannot be read or edited.
+    The file need not exist and is replaced atomically. Raises InputError if it cannot be read or edited.
     """
-    text = ""
-    if path.exists():
-        read_toml(path)
-        text = path.read_text(encoding="utf-8")
+    text = _text(path)
     text = replace_table(text, "floor_camera", assignments(camera), str(path))
     maker = note.split(":")[0]
     lines = [line for line in text.splitlines() if not line.startswith(f"# {maker}:")]
     header = next(k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[floor_camera]"))
     lines.insert(header + 1, f"# {note}")
     text = "\n".join(lines) + "\n"
-    bind(Calibration, tomllib.loads(text), str(path))
-    _replace(path, text)
+    _save(path, text)
 
 
 def save_lens(camera: CameraModel, path: Path, priors: Priors) -> None:
@@ -326,10 +317,8 @@ def save_lens(camera: CameraModel, path: Path, priors: Priors) -> None:
     ConfigError
         If the file cannot be read or edited.
     """
-    text, before = "", Calibration()
-    if path.exists():
-        before = load_calibration(path)
-        text = path.read_text(encoding="utf-8")
+    before = load_calibration(path) if path.exists() else Calibration()
+    text = _text(path)
     values = assignments(camera)
     del values["name"]
     if camera.valid_radius_px is None:  # to the picture's farthest corner, because an older limit must not stay
@@ -348,8 +337,7 @@ def save_lens(camera: CameraModel, path: Path, priors: Priors) -> None:
             if (value := getattr(priors, name)) > getattr(before.priors, name)
         }
         text = replace_table(text, "priors", raised, str(path)) if raised else text
-    bind(Calibration, tomllib.loads(text), str(path))
-    _replace(path, text)
+    _save(path, text)
 
 
 def save_rig(cameras: Sequence[CameraModel], beacons: Mapping[str, Vector3], path: Path, priors: Priors) -> None:
@@ -371,10 +359,8 @@ def save_rig(cameras: Sequence[CameraModel], beacons: Mapping[str, Vector3], pat
     ConfigError
         If the file cannot be read or edited.
     """
-    text, before = "", Calibration()
-    if path.exists():
-        before = load_calibration(path)
-        text = path.read_text(encoding="utf-8")
+    before = load_calibration(path) if path.exists() else Calibration()
+    text = _text(path)
     known = {camera.name for camera in before.cameras}
     for camera in cameras:
         values = assignments(camera)
@@ -385,8 +371,7 @@ def save_rig(cameras: Sequence[CameraModel], beacons: Mapping[str, Vector3], pat
     text = replace_table(text, "priors", {name: repr(getattr(priors, name)) for name in names}, str(path))
     if beacons:
         text = replace_table(text, "beacons", {name: toml(place) for name, place in beacons.items()}, str(path))
-    bind(Calibration, tomllib.loads(text), str(path))
-    _replace(path, text)
+    _save(path, text)
 
 
 def save_stamp_offsets(offsets: Mapping[str, float], path: Path) -> None:
@@ -394,28 +379,26 @@ def save_stamp_offsets(offsets: Mapping[str, float], path: Path) -> None:
 
     Replaces the file atomically. Raises ConfigError if the file cannot be read or edited.
     """
-    text = ""
-    if path.exists():
-        read_toml(path)
-        text = path.read_text(encoding="utf-8")
+    text = _text(path)
     text = replace_table(
         text, "stamp_offsets", {name: repr(round(late, 5)) for name, late in offsets.items()}, str(path)
     )
-    bind(Calibration, tomllib.loads(text), str(path))
-    _replace(path, text)
+    _save(path, text)
 
 
 def _lines(record: Any) -> list[str]:
     return [f"{key} = {value}" for key, value in assignments(record).items()]
 
 
-def _replace(path: Path, text: str) -> None:
-    path = path.resolve()  # because a link to the file must stay one
-    part = path.with_name(path.name + ".part")
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())  # because after a power loss a new name may stand for an empty file
-    if path.exists():
-        shutil.copymode(path, part)
-    part.replace(path)
+def _text(path: Path) -> str:
+    """What is in a file, "" if there is none; raises ConfigError if it is no TOML."""
+    if not path.exists():
+        return ""
+    read_toml(path)
+    return path.read_text(encoding="utf-8")
+
+
+def _save(path: Path, text: str) -> None:
+    """Put a calibration in place of the file, atomically; raises ConfigError if it would have mistakes."""
+    bind(Calibration, tomllib.loads(text), str(path))
+    write_atomic(path, text.encode())

@@ -165,7 +165,8 @@ def check_together(control: Path, seconds: float) -> Iterator[Finding]:
                 drivers = _ask(channel, lines, "drivers.list", {})["drivers"]
                 for driver in drivers:
                     if driver["state"] == "fault":
-                        yield Finding("error", f"driver {driver['name']}", driver["fault"], "see robotctl logs")
+                        text, _, mend = driver["fault"].partition("; ")
+                        yield Finding("error", f"driver {driver['name']}", text, mend or "see robotctl logs")
                 yield Finding("ok", what, f"is running, with {len(drivers)} drivers")
                 if not seconds:
                     return

@@ -15,6 +15,7 @@ import json
 import math
 import os
 import re
+import shutil
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -462,7 +463,10 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Replace a file as a whole: written beside it, flushed to the disk, renamed; raises InputError if it fails."""
+    """Replace a file as a whole: written beside it, flushed to the disk, renamed; its mode and links to it stay.
+
+    Raises InputError if it cannot be written.
+    """
     path = Path(path)
     try:
         if path.exists() and not path.is_file():  # a pipe or a terminal has nothing to be replaced
@@ -475,6 +479,8 @@ def write_atomic(path: str | Path, data: bytes) -> None:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
+            if target.exists():
+                shutil.copymode(target, temporary)
             temporary.replace(target)
         finally:
             temporary.unlink(missing_ok=True)

@@ -10,8 +10,10 @@ import pytest
 
 from robotd.clock import now
 from robotd.config import Calibration
+from robotd.errors import DriverFault
 from robotd.recording import read_frames
 from robotd.records import CameraModel, Frame, Transform
+from robotd.v4l2 import MORE_ROOM, NO_ROOM
 from tests.operated import QUICK, operated
 
 
@@ -189,6 +191,14 @@ def test_everything_together_finds_a_camera_that_loses_frames(tmp_path):
         ill = {item["what"]: item for item in (await client.call("test", seconds=10.0))["findings"]}
         assert ill["camera eye, all together"]["level"] == "warning"
         assert "fps" in ill["camera eye, all together"]["mend"]
+
+        async def refuse(mode):
+            raise DriverFault(f"/dev/video0 cannot stream: {NO_ROOM}; {MORE_ROOM}")
+
+        robot.eye._stream = refuse
+        full = {item["what"]: item for item in (await client.call("test", seconds=10.0))["findings"]}
+        assert full["camera eye"]["text"].endswith("cannot stream: its USB bus has no room")
+        assert full["camera eye"]["mend"] == MORE_ROOM
         robot.course.wire.is_cut = True
         async with asyncio.timeout(60.0):
             cut = {item["what"]: item for item in (await client.call("test", seconds=10.0))["findings"]}

@@ -120,7 +120,7 @@ class LineTracker:
         self._now: Motion | None = None
         self._stamp = 0.0
         self._seen: Sight | None = None
-        self._ends = self._more = 0
+        self._ends = self._more = self._doubts = 0
         self._odometer.reset()
         self._finished: list[tuple[Floats, Floats]] = []
         self.confidence = 0.0
@@ -247,7 +247,7 @@ class LineTracker:
             return False
         self._map.start(np.vstack([approach(pose, best[1].points), best[1].points]))
         self._junctions.forget()
-        self._ends = self._more = 0
+        self._ends = self._more = self._doubts = 0
         self._note(best[1])
         return True
 
@@ -397,7 +397,7 @@ class LineTracker:
             return True
         self._more += 1
         if self._more >= MORE:
-            self._ends = self._more = 0
+            self._ends = self._more = self._doubts = 0
         return self._more == 0
 
     def _is_more(self, sight: Sight) -> bool:
@@ -455,11 +455,22 @@ class LineTracker:
         bare = bare and not any(
             np.hypot(*(sight.points - end).T).min() < BESIDE and not self._is_ours(sight) for sight in found
         )
-        self._ends = self._ends + 1 if bare else 0 if is_seen else self._ends
+        if bare:
+            self._ends, self._doubts = self._ends + 1, 0
+        elif is_seen:  # an end that counts falls only to several frames in a row
+            self._doubts += 1
+            self._ends = self._ends if self.ends and self._doubts < MORE else 0
 
     def _is_ours(self, sight: Sight) -> bool:
-        match = self._map.match(sight, self.config.match) or self._map.match(sight.reversed(), self.config.match)
-        return match is not None and bool(match.on.mean() > 0.7)
+        """Whether a sight shows the remembered line, of which it may show a little more than is remembered."""
+        out = self._map.end_direction()
+        for one in (sight, sight.reversed()):
+            if (match := self._map.match(one, self.config.match)) is not None:
+                beyond = one.points - self.path[-1]
+                ahead, aside = beyond @ out, np.abs(beyond @ [-out[1], out[0]])
+                is_tip = (ahead >= 0.0) & (ahead <= TIP) & (aside <= self.config.spacing)
+                return bool((match.on | is_tip).mean() > 0.7)
+        return False
 
     # ---- upkeep ------------------------------------------------------------------------------------------------------
 
