@@ -149,3 +149,13 @@ def test_a_mission_by_markers_stops_at_squares_and_dots_and_ends_with_the_line(t
     assert stood == pytest.approx({1: 0.0, 2: 0.5, 3: 0.9}, abs=0.03)
     assert "the line ended after stop 3: all its markers are made" in told
     assert world.body.pose.x - shift[0] == pytest.approx(1.2, abs=0.03)
+
+
+def test_a_robot_that_is_put_down_near_the_end_of_its_line_halts_there():
+    """The last of the tape is seen a little longer than remembered, which must not make another line of it."""
+    layout, shift = store([(0.0, 0.0), (1.2, 0.0)], texture="concrete")
+    layout = dataclasses.replace(layout, line=dataclasses.replace(layout.line, stops=(0.7,)))
+    result = drive(layout, [math.inf], seed=1, at_marker=True)
+    assert result.fault is None
+    assert [ended for ended, *_ in result.stops] == ["end"]
+    assert result.pose.x - shift[0] == pytest.approx(1.2, abs=0.05)

@@ -405,23 +405,6 @@ def test_the_end_of_the_line_is_an_end_only_once_bare_floor_is_seen_beyond_it():
     assert tracker.path[-1, 0] == pytest.approx(1.5, abs=0.03)
 
 
-def test_an_end_that_was_seen_stays_one_while_the_last_of_the_line_leaves_the_view():
-    """The last 12 cm of tape are seen 4 cm longer than in the frames before, by which the memory was cut."""
-    tracker, path, history = LineTracker(VIEW), line_along_x(length=1.6), straight_history(duration=8.0)
-    drive(tracker, path[path[:, 0] < 1.5], history, np.arange(0.0, 5.0, 1 / 30))
-    assert tracker.ends
-    shown = iter([*6 * [(1.30, 1.46)], (1.38, 1.51), *9 * [(0.0, 0.0)]])
-
-    def lines(pose):
-        least, most = next(shown)
-        part = path[(path[:, 0] > least) & (path[:, 0] < most)]
-        return [Line(VIEW.to_pixels(to_robot(part, pose)), 14.0, 0.9)] if len(part) else []
-
-    drive(tracker, None, history, np.arange(5.0, 5.5, 1 / 30), lines=lines)
-    assert tracker.ends
-    assert tracker.path[-1, 0] == pytest.approx(1.48, abs=0.03)
-
-
 def test_a_gap_is_bridged_and_is_no_end():
     tracker, path = LineTracker(VIEW), line_along_x(length=4.0)
     torn = [path[path[:, 0] < 1.2], path[path[:, 0] > 1.42]]
