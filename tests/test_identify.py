@@ -363,6 +363,17 @@ def test_a_system_that_may_be_faster_gets_its_requests_earlier():
     assert [portion.after for portion in early] == [0.0]
 
 
+def test_slots_in_which_nothing_was_seen_teach_nothing_about_the_system():
+    inquiry = inquire(100)
+    before = inquiry.delays.interval
+    inquiry.next_question(None, 0.0)
+    inquiry.begin(0.0)
+    inquiry.answer(np.zeros((0, len(DURATIONS))), np.zeros((0, len(DURATIONS))), 15.0)
+    posterior = inquiry.posterior(Prior(np.ones(100)), 0)
+    assert posterior.none.shape == (0,)
+    assert inquiry.delays.interval == before
+
+
 def test_an_unknown_queue_is_waited_for_until_it_is_silent():
     inquiry = inquire(100)
     inquiry.next_question(None, 50.0)

@@ -26,6 +26,8 @@ WORTH = 10.5  # log-likelihood below the best one, if all moments fitted, of lab
 def search_interval(evidence: Sequence[Evidence], prior: Prior, delays: DelayModel) -> float:
     """Seconds between two commands under which the lights' answers are likeliest; `delays` is not changed."""
     lights = max((len(slot.scores) for slot in evidence), default=0)
+    if not lights:
+        return delays.interval
     flashed = np.zeros(lights)
     for slot in evidence:
         flashed[: len(slot.scores)] += slot.scores.max(axis=1, initial=0.0) > 3.0
