@@ -86,9 +86,8 @@ def join(
                 continue
             pixel, spread = flat
             seen.append(Seen(names[dwell.calibration], dwell.beacon, pixel, spread))
-            sigma = float(
-                np.sqrt(0.5 * np.trace(spread))
-            )  # what the calibration leaves open is the camera's covariance
+            # what the calibration leaves open is the same for all of a camera's sightings, and is said with the camera
+            sigma = float(np.sqrt(0.5 * np.trace(spread)))
             u, v = float(pixel[0]), float(pixel[1])
             found.append(BeaconSighting(names[dwell.calibration], dwell.beacon, u, v, sigma))
         if found:

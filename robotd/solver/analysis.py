@@ -21,6 +21,7 @@ from .mapping import to_map
 from .placement import segments
 from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Ints, Problem, State, anchors, build_problem
 from .robust import SLIPPED, Optimum, optimise
+from .ties import unchecked
 
 JOINING = 3  # shared labels that join two parts of a survey, as in placement
 _LEVEL_M = 0.05  # a label is at camera height within this
@@ -231,6 +232,7 @@ def _after(optimum: Optimum, result: Map, scale: float | None) -> list[str]:
         distance = _outside(others, state.points[i, :2]) if len(placed) <= 500 else 0.0
         if distance > _OUTSIDE_M:
             far.append(f"{problem.labels[i]} by {distance:.1f} m")
+    found += unchecked(problem, problem.sightings.select(optimum.inlier))
     if far:
         found.append(
             f"outside everything else that was mapped: {_listed(far)}; a label that was seen in glass only looks like "

@@ -29,8 +29,9 @@ from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
 from .initial import world_rays
 from .linear import solve_linear
-from .problem import Bools, Problem, Sightings, build_problem, stops_per_label
+from .problem import Bools, Problem, Sightings, State, build_problem, stops_per_label
 from .robust import Optimum, optimise
+from .ties import Rival, side_of
 from .weights import OUTLIER
 
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
@@ -43,6 +44,7 @@ _CLEARLY_BETTER = 0.25  # of that share, to blame two cameras
 _MOST_TO_TRY = 5000  # sightings
 _OUTSIDE_M = 0.5  # a position so far outside all others may be an image in a shop window or a glossy shelf
 _SAME_PLACE_M = 0.05
+_SURPRISE = 21.1  # chi square of 3 degrees of freedom that chance exceeds once in 10 000
 _CLEARLY_NEARER_M = 0.2
 _UNKNOWN = np.diag([1e6, 1e6, np.pi**2])  # covariance of a stop that nothing ties to the world
 
@@ -108,6 +110,8 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
         )
     if share < _FITS:
         notes.append(_misfit(asked, share))
+    if optimum.rival is not None and tally.elsewhere.any():
+        notes.append(_two_ways(problem, optimum.rival, tally.elsewhere, state))
     if len(problem.sightings) == 0:
         notes.append("the survey has no usable sightings, so no label has a position")
     fit = optimum.adjustment.residuals(state, SQUARE)
@@ -131,7 +135,7 @@ class _Tally:
 
     `row` is its place in the adjustment or -1, `known` in the problem's known labels or -1, `sigma` its largest
     standard deviation, `position` and `covariance` as in the map, the latter by row, `agreeing` and `doubting` sums of
-    its sightings' probabilities, `in_front` (L, 3) see _in_front.
+    its sightings' probabilities, `in_front` (L, 3) see _in_front, `elsewhere` (L,) see _elsewhere.
     """
 
     asked_stops: list[int]
@@ -147,6 +151,7 @@ class _Tally:
     covariance: list[Matrix3]
     in_front: Floats
     image: list[bool]
+    elsewhere: Bools
 
 
 def _tally(asked: Problem, optimum: Optimum) -> _Tally:
@@ -181,6 +186,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
         ],
         in_front=in_front,
         image=image,
+        elsewhere=_elsewhere(optimum),
     )
 
 
@@ -253,10 +259,37 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
     sigma = tally.sigma[i]
     if not sigma <= WIDEST_SIGMA_M:
         return unplaced(f"views nearly parallel (standard deviation {sigma:.2g} m); map it from a stop further aside")
+    if tally.elsewhere[i]:
+        assert optimum.rival is not None
+        reason = "the stops that saw it are tied to the others in two ways that fit equally well; see the map's notes"
+        ways = ((optimum.state, optimum.rival.chosen_cost), (optimum.rival.state, optimum.rival.cost))
+        candidates = tuple(Candidate(_vector(way.points[i]), cost) for way, cost in ways)
+        return MappedLabel(label, "ambiguous", None, None, count, inliers, reason, candidates)
     if tally.image[i]:
         reason = "perhaps an image in glass: one sighting puts the label nearer; map it from another stop"
         return _ambiguous(optimum, i, label, count, inliers, tally.in_front[i], reason)
     return MappedLabel(label, "placed", position, covariance, count, inliers)
+
+
+def _elsewhere(optimum: Optimum) -> Bools:
+    """(L,) labels that a rival optimum of the whole survey has clearly elsewhere."""
+    result = np.zeros(len(optimum.problem.labels), dtype=np.bool_)
+    if optimum.rival is None:
+        return result
+    labels = optimum.adjustment.labels
+    apart = optimum.rival.state.points[labels] - optimum.state.points[labels]
+    surprise = (apart * np.linalg.solve(optimum.covariance.points, apart[:, :, None])[:, :, 0]).sum(axis=1)
+    result[labels] = (surprise > _SURPRISE) & (np.linalg.norm(apart, axis=1) > _SAME_PLACE_M)
+    return result
+
+
+def _two_ways(problem: Problem, rival: Rival, elsewhere: Bools, state: State) -> str:
+    apart = float(np.linalg.norm(rival.state.points - state.points, axis=1)[elsewhere].max())
+    labels = ", ".join(problem.labels[i] for i in rival.tie.labels)
+    return (
+        f"leg/stop {side_of(problem, rival.tie)} and the rest share only {labels}, and fit together in two ways, up to "
+        f"{apart:.2f} m apart, equally well; map more of the same labels from both"
+    )
 
 
 def _in_front(optimum: Optimum) -> Floats:

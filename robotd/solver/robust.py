@@ -19,6 +19,7 @@ from .covariance import Covariance, covariance
 from .initial import epipolar_moves, triangulate, world_rays
 from .placement import Placement, at_first_stop, detach, place, retriangulate
 from .problem import Bools, Ints, Known, Problem, State, anchors, stops_per_label
+from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
 
 _SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
@@ -66,7 +67,7 @@ class Optimum:
     sightings take part; `adjustment` is their least-squares problem and `state` its optimum. `placed` (S,) are the
     stops that have a place in the world. `reflected` (N,) are sightings of a label's image in floor or glass. `gain`
     (L,) is each label's support, `rival_points` (L, 3) the second best position (NaN where there is none) and
-    `rival_gain` (L,) its support.
+    `rival_gain` (L,) its support. `rival` is another optimum of the whole survey that explains it about as well.
     """
 
     problem: Problem
@@ -79,6 +80,7 @@ class Optimum:
     gain: Floats
     rival_points: Floats
     rival_gain: Floats
+    rival: Rival | None
     iterations: int
     converged: bool
 
@@ -189,6 +191,7 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
     tolerance = max(1e-2, 1e-5 * len(problem.sightings))
     solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=tolerance, damping=1e-6)
     iterations, state = iterations + solution.iterations, solution.state
+    state, rival = doubted(problem, state, problem.sightings.select(_support(everything, state)[1]))
     state, reflected, hypotheses = _out_of_glass(problem, state)
     if reflected.any():
         hypotheses = _hypotheses(problem, state)
@@ -227,6 +230,7 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         gain,
         rival_points,
         rival_gain,
+        rival,
         iterations,
         converged,
     )
