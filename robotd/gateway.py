@@ -35,7 +35,7 @@ import sys
 import time
 from collections import OrderedDict, deque
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +68,15 @@ class Outbox:
         One line of an instruction file, in Python's format syntax, with label, duration (s) and strength (0..1).
     guard_s : float
         Time between two files at least; 0: each goes into the folder at once.
+    clear_s : float
+        Time after which our files are deleted, where the label system leaves them in the folder; 0: it deletes them.
     """
 
-    def __init__(self, folder: Path, template: str = TEMPLATE, guard_s: float = 0.0) -> None:
+    def __init__(self, folder: Path, template: str = TEMPLATE, guard_s: float = 0.0, clear_s: float = 0.0) -> None:
         self.folder = folder
         self.guard_s = guard_s
+        self.clear_s = clear_s
+        self._since: dict[str, float] = {}  # when files were first seen in the folder, in the caller's clock
         self.held: deque[str] = deque()  # names of files that wait for their guard time
         self._latest = -math.inf  # when the latest file went into the folder, in the caller's clock
         self.work = folder / ".robotd-labels"
@@ -148,6 +152,16 @@ class Outbox:
             self._latest = now
         return None
 
+    def clear(self, now: float) -> None:
+        """Delete files that the label system has had time to read; raises OSError."""
+        if not self.clear_s:
+            return
+        there = [name for name in os.listdir(self.folder) if _FILE.fullmatch(name)]
+        self._since = {name: self._since.get(name, now) for name in there}
+        for name, since in self._since.items():
+            if now >= since + self.clear_s:
+                (self.folder / name).unlink(missing_ok=True)
+
     def waiting(self) -> int:
         """How many of our files the label system has not fetched yet."""
         return len(self.held) + sum(1 for name in os.listdir(self.folder) if _FILE.fullmatch(name))
@@ -159,7 +173,10 @@ class Outbox:
         except OSError as error:
             return f"{self.folder} cannot be read: {error.strerror or error}"
         if waiting >= WAITING_LIMIT:
-            return f"{waiting} instruction files wait in {self.folder}; is the label system running and watching it?"
+            return (
+                f"{waiting} instruction files wait in {self.folder}; is the label system running and watching it? "
+                "If it leaves what it has read, start this program with --clear 60"
+            )
         if not os.access(self.folder, os.W_OK) or not os.access(self.work, os.W_OK):
             return f"{self.folder} cannot be written; give this program's user the right to"
         return None
@@ -231,12 +248,15 @@ class Gateway:
         while True:
             try:
                 due = self.outbox.release(loop.time())
+                self.outbox.clear(loop.time())
+                if due is None and self.outbox.clear_s:
+                    due = max(RETRY_S, 0.1 * self.outbox.clear_s)
             except OSError as error:
                 print(f"robotd-labels: {self.outbox.folder}: {error.strerror or error}; tried again", file=sys.stderr)
-                due = None
+                due = RETRY_S
             self.held.clear()
             with suppress(TimeoutError):
-                await asyncio.wait_for(self.held.wait(), RETRY_S if due is None else due)
+                await asyncio.wait_for(self.held.wait(), due)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -294,7 +314,11 @@ class Gateway:
         if method == "status":
             _check_keys(request, set(), set())
             trouble = self.outbox.trouble()
-            return {"waiting": self.outbox.waiting() if trouble is None else None, "trouble": trouble}
+            try:
+                waiting = self.outbox.waiting()
+            except OSError:  # which is the trouble, or begins just now
+                waiting = None
+            return {"waiting": waiting, "trouble": trouble}
         if method == "labels":
             _check_keys(request, set(), {"start"})
             return self._listed(request.get("start", 0))
@@ -332,8 +356,8 @@ class Gateway:
             raise RefusedError(f"start: found {_quote(start)}; expected a whole number of 0 or more")
         try:
             date = self.labels.stat().st_mtime_ns
-            text = self.labels.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+            text = _text(self.labels)
+        except (OSError, ValueError) as error:
             raise RefusedError(f"--labels {self.labels}: {error}") from error
         if len(text) > TEXT_LIMIT:
             raise RefusedError(f"--labels {self.labels}: more than {TEXT_LIMIT} characters; is that a list of labels?")
@@ -409,12 +433,15 @@ def _quote(value: Any) -> str:
 
 def _check_template(template: str) -> set[str]:
     """The characters that separate fields in a line; raises ValueError if the template makes no such line."""
-    names, separators = set(), {"\n", "\r"}
+    names: list[str] = []
+    separators = {"\n", "\r"}
     for literal, name, _, _ in string.Formatter().parse(template):
         separators |= {char for char in literal if not char.isalnum()}
         if name is not None:
-            names.add(name)
-    if unknown := sorted(names - set(FIELDS)):
+            if names and not literal:
+                raise ValueError(f"nothing between {{{names[-1]}}} and {{{name}}}")
+            names.append(name)
+    if unknown := sorted(set(names) - set(FIELDS)):
         raise ValueError(f"unknown field {{{unknown[0]}}}; known are {', '.join(FIELDS)}")
     if "label" not in names:
         raise ValueError("no field {label}")
@@ -429,6 +456,35 @@ def _write(path: Path, mode: str, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def _text(path: Path) -> str:
+    """The text of a file that a person wrote; raises OSError, and ValueError if it is no UTF-8."""
+    try:
+        return path.read_text(encoding="utf-8-sig")  # Notepad begins its files with a mark
+    except UnicodeDecodeError as error:
+        raise ValueError(f"not UTF-8 at byte {error.start}; save it as UTF-8 (PowerShell: -Encoding utf8)") from error
+
+
+@contextmanager
+def _alone(work: Path) -> Iterator[None]:
+    """Keep other gateways from the folder: two would give their files the same names.
+
+    Raises BlockingIOError if one runs. The lock ends with the process, however that ends.
+    """
+    with open(work / "lock", "a+b") as file:
+        try:
+            if sys.platform == "win32":
+                import msvcrt
+
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise BlockingIOError(error.errno, "another robotd-labels serves this folder", str(work.parent)) from None
+        yield
 
 
 def _rename(old: Path, new: Path) -> None:
@@ -453,27 +509,49 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--token-file", type=Path, help="file with the secret that requests must carry")
     parser.add_argument("--template", default=TEMPLATE, help=f"one line of an instruction file (default: {TEMPLATE})")
     parser.add_argument("--guard", type=float, default=0.0, help="seconds between two instruction files (default: 0)")
+    parser.add_argument(
+        "--clear",
+        type=float,
+        default=0.0,
+        help="delete our files after so many seconds, where the label "
+        "system leaves them (default: 0, it deletes them itself)",
+    )
     parser.add_argument("--labels", type=Path, help="the label system's list of its labels, for robots that ask")
     options = parser.parse_args(arguments)
     if not 0.0 <= options.guard <= 3600.0:
         parser.error(f"--guard {options.guard:g}: expected seconds from 0 to 3600")
+    if not (options.clear == 0.0 or 5.0 <= options.clear <= 1e6):
+        parser.error(
+            f"--clear {options.clear:g}: expected 0, or seconds from 5 to 1000000, several scans of the folder"
+        )
+    if not 0 <= options.port <= 65535:
+        parser.error(f"--port {options.port}: expected a number from 1 to 65535, or 0 for a free one")
+    if not options.folder.is_dir():
+        print(
+            f"robotd-labels: {options.folder} is no folder; --folder is what the label system watches", file=sys.stderr
+        )
+        return 1
     token = None
     if options.token_file is not None:
         try:
-            token = options.token_file.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            parser.error(f"--token-file: {error}")
+            token = _text(options.token_file).strip()
+        except (OSError, ValueError) as error:
+            parser.error(f"--token-file {options.token_file}: {getattr(error, 'strerror', None) or error}")
         if not token:
             parser.error(f"--token-file: {options.token_file} is empty")
     elif options.host not in ("127.0.0.1", "::1", "localhost"):
         parser.error(f"--host {options.host}: without --token-file only 127.0.0.1 may be served")
     try:
-        outbox = Outbox(options.folder, options.template, options.guard)
+        outbox = Outbox(options.folder, options.template, options.guard, options.clear)
     except (ValueError, IndexError, KeyError) as error:
         parser.error(f"--template '{options.template}': {error}; expected for example '{TEMPLATE}'")
+    if "{duration" not in options.template:
+        print("robotd-labels: the template has no {duration}: set durations_s on the robot to the one that labels have")
     try:
-        outbox.open()
-        asyncio.run(Gateway(outbox, token, options.labels).serve(options.host, options.port))
+        outbox.work.mkdir(exist_ok=True)
+        with _alone(outbox.work):
+            outbox.open()
+            asyncio.run(Gateway(outbox, token, options.labels).serve(options.host, options.port))
     except OSError as error:
         print(
             f"robotd-labels: {error.filename or f'{options.host} port {options.port}'}: {error.strerror}",

@@ -164,9 +164,46 @@ def test_the_queue_has_a_limit(desk, tmp_path, monkeypatch):
     assert ask(desk, FLASH)["ok"]
     assert ask(desk, FLASH)["ok"]
     assert "2 instruction files wait in" in ask(desk, FLASH)["error"]
+    assert "start this program with --clear 60" in ask(desk, FLASH)["error"]
     assert "2 instruction files wait in" in ask(desk, {"token": TOKEN, "method": "status"})["trouble"]
     (tmp_path / "robotd-000000000001.txt").unlink()
     assert ask(desk, FLASH)["ok"]
+
+
+def test_files_that_a_label_system_leaves_are_cleared_away_in_time_and_only_ours(tmp_path):
+    outbox = Outbox(tmp_path, clear_s=60.0)
+    outbox.open()
+    (tmp_path / "others.txt").write_text("not ours")
+    for number in range(3):
+        outbox.flash(["A1"], [3], 1.0, None, "test", 10.0 * number)
+        outbox.clear(10.0 * number)
+    assert outbox.waiting() == 3
+    outbox.clear(69.0)
+    assert outbox.waiting() == 2
+    again = Outbox(tmp_path, clear_s=60.0)  # a restart: how long they have lain there is not known
+    again.open()
+    again.clear(100.0)
+    again.clear(159.0)
+    assert again.waiting() == 2
+    again.clear(160.0)
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["others.txt"]
+    again.flash(["A1"], [3], 1.0, None, "test", 170.0)
+    assert [path.name for path in tmp_path.glob("robotd-*.txt")] == ["robotd-000000000004.txt"]
+
+
+def test_the_program_clears_the_folder_by_itself(tmp_path):
+    async def watch():
+        desk = Gateway(Outbox(tmp_path, clear_s=60.0), None)
+        desk.outbox.open()
+        releasing = asyncio.create_task(desk._release())
+        desk.outbox.flash(["A1"], [3], 1.0, None, "test", 0.0)
+        await asyncio.sleep(50.0)
+        assert desk.outbox.waiting() == 1
+        await asyncio.sleep(30.0)
+        assert desk.outbox.waiting() == 0
+        releasing.cancel()
+
+    run_virtual(watch())
 
 
 def test_a_folder_that_cannot_be_written_is_an_answer(desk, tmp_path):
@@ -256,7 +293,17 @@ def test_the_instruction_file_follows_the_template(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "template", ["FLASH", "{label.__class__}", "{}", "{label} {colour}", "{label", "{label:d}", "{label}\n{label}"]
+    "template",
+    [
+        "FLASH",
+        "{label}{duration};1",
+        "{label.__class__}",
+        "{}",
+        "{label} {colour}",
+        "{label",
+        "{label:d}",
+        "{label}\n{label}",
+    ],
 )
 def test_templates_that_make_no_line_are_refused(tmp_path, capsys, template):
     with pytest.raises(SystemExit) as stop:
@@ -392,8 +439,8 @@ def test_the_program_answers_through_noise_and_leaves_cleanly(tmp_path):
 
 def test_wrong_command_lines_are_explained(tmp_path, capsys):
     assert main(["--folder", str(tmp_path / "gone")]) == 1
-    assert "gone" in capsys.readouterr().err
-    for arguments in (["--token-file", str(tmp_path / "no")], ["--host", "0.0.0.0"]):
+    assert "gone is no folder; --folder is what" in capsys.readouterr().err
+    for arguments in (["--token-file", str(tmp_path / "no")], ["--port", "99999"], ["--host", "0.0.0.0"]):
         with pytest.raises(SystemExit):
             main(["--folder", str(tmp_path), *arguments])
     assert "without --token-file only 127.0.0.1" in capsys.readouterr().err
@@ -402,3 +449,34 @@ def test_wrong_command_lines_are_explained(tmp_path, capsys):
         taken.listen()
         assert main(["--folder", str(tmp_path), "--port", str(taken.getsockname()[1])]) == 1
     assert "robotd-labels: 127.0.0.1 port" in capsys.readouterr().err
+
+
+def test_files_that_windows_editors_save_are_read_or_refused_in_words(tmp_path, capsys):
+    token, watched = tmp_path / "token", tmp_path / "watched"
+    watched.mkdir()
+    token.write_bytes("\ufeffsecret\r\n".encode())
+    assert gateway._text(token).strip() == "secret"
+    token.write_bytes("secret".encode("utf-16"))
+    with pytest.raises(SystemExit):
+        main(["--folder", str(watched), "--token-file", str(token)])
+    assert "not UTF-8 at byte 0; save it as UTF-8" in capsys.readouterr().err
+    token.write_bytes("\ufeffA1\n".encode())
+    desk = Gateway(Outbox(watched), None, token)
+    assert ask(desk, {"method": "labels"})["text"] == "A1\n"
+
+
+def test_two_gateways_do_not_serve_one_folder(tmp_path, capsys):
+    with program(tmp_path) as running:
+        assert main(["--folder", str(running.watched)]) == 1
+        assert "another robotd-labels serves this folder" in capsys.readouterr().err
+        running.process.kill()
+        running.process.wait(10)
+        with gateway._alone(running.watched / ".robotd-labels"):  # a lock dies with its process
+            pass
+
+
+def test_status_survives_a_folder_that_goes_away(tmp_path, monkeypatch):
+    desk = make_desk(tmp_path)
+    monkeypatch.setattr(desk.outbox, "trouble", lambda: None)  # it was there a moment ago
+    shutil.rmtree(tmp_path)
+    assert ask(desk, {"method": "status", "token": TOKEN}) == {"id": None, "ok": True, "waiting": None, "trouble": None}

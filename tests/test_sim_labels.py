@@ -71,6 +71,24 @@ def test_files_are_obeyed_in_the_order_of_their_names_and_deleted(tmp_path):
     assert on[0][1] == on[0][2] == 0.0
 
 
+def test_without_any_feedback_files_stay_and_each_is_obeyed_once(tmp_path):
+    silent = LabelSystemSettings(lost_fraction=0.0, clock_error=0.0, feedback=False)
+    command(tmp_path, "robotd-1.txt", "FLASH;A0;3;1.0")
+    (tmp_path / "robotd-2.txt").write_text("FLASH;A1;3")  # half written
+    system = make_system(tmp_path, silent)
+    system.scan(10.0)
+    command(tmp_path, "robotd-2.txt", "FLASH;A1;3;1.0", "FLASH;A2;3;1.0")
+    for t in (13.0, 16.0):
+        system.scan(t)
+    assert system.commands == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["robotd-1.txt", "robotd-2.txt"]
+    (tmp_path / "robotd-1.txt").unlink()  # whoever wrote it may clear it away, and use its name again
+    system.scan(19.0)
+    command(tmp_path, "robotd-1.txt", "FLASH;A3;3;1.0")
+    system.scan(22.0)
+    assert system.commands == 4
+
+
 def test_a_flash_is_three_blinks_at_5_hz_each_second(tmp_path):
     command(tmp_path, "a.txt", "FLASH;A3;2;1.0")
     system = make_system(tmp_path, PROMPT)

@@ -44,7 +44,7 @@ class Candidates:
     known. `wanted` false: nobody would learn anything from its flash. `asked` how often it was asked at other stops:
     when there is no time for all, the ones least asked come first. `rivals` per expected label the labels whose
     predicted image positions are near enough to be confused with it, itself among them. `owed` labels that the audit
-    should have asked at earlier stops.
+    should have asked at earlier stops. `known` those that have been seen.
     """
 
     weights: Floats
@@ -53,12 +53,14 @@ class Candidates:
     asked: Numbers
     rivals: dict[int, Numbers] = field(default_factory=dict)
     owed: float = 0.0
+    known: Flags = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod
     def anything(cls, labels: int) -> Candidates:
         """Nothing is known: every label may be visible."""
         flags = np.ones(labels, bool)
-        return cls(np.full(labels, min(1.0, FIRST_LIGHTS / max(labels, 1))), ~flags, flags, np.zeros(labels, np.intp))
+        weights = np.full(labels, min(1.0, FIRST_LIGHTS / max(labels, 1)))
+        return cls(weights, ~flags, flags, np.zeros(labels, np.intp), known=~flags)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,6 +189,7 @@ class Inquiry:
         )
         named = np.flatnonzero(posterior.decided(config.min_probability) & (posterior.none < 0.5))
         worth = len(undecided) >= max(1.0, config.repeat_fraction * (len(named) + len(undecided)))
+        worth |= any(self._is_new(*posterior.candidates[light]) for light in undecided)
         audit = silent = np.zeros(0, np.intp)
         if len(self.evidence) == 1:
             known = np.flatnonzero(candidates.expected & self.asked)
@@ -210,6 +213,10 @@ class Inquiry:
             return None
         doubt = (1.0 - posterior.probability[undecided]) / np.maximum(posterior.probability[undecided], 1e-9)
         return self._compose(ask, ask[:0], lists, float(np.median(doubt)) if len(doubt) else 0.0)
+
+    def _is_new(self, labels: Numbers, odds: Floats) -> bool:
+        """Whether a light with these candidates is probably a label that was never seen: perhaps nowhere else."""
+        return float(odds[~self.candidates.known[labels]].sum()) > 0.5
 
     def _still_there(self, silent: Numbers) -> Numbers:
         """Those of the labels without an answer that are in view rather than hidden, though their flashes were lost."""

@@ -164,13 +164,17 @@ class LabelMemory:
         wanted = unseen | self._expected
         unlikely = np.flatnonzero(~wanted)
         few = round(UNLIKELY_S * self.config.commands_per_s)
-        wanted[unlikely[np.argsort(-weights[unlikely], kind="stable")[:few]]] = True
+        once = np.array([len({ray[2] for ray in self._rays[int(label)]}) == 1 for label in unlikely], bool)
+        doubtful = np.lexsort((self.asked[unlikely], ~once, -weights[unlikely]))  # a wrong name is seen but once
+        wanted[unlikely[doubtful[:few]]] = True
         for labels, begin, end in self._zones:
             if not begin <= travelled <= end:
                 wanted[labels] = False
                 weights[labels] = 0.0
         wanted[[self.index[label] for label in self.learnt | self.refused]] = False
-        return Candidates(weights, self._expected & wanted, wanted, self.asked.copy(), self._rivals(), self.owed)
+        return Candidates(
+            weights, self._expected & wanted, wanted, self.asked.copy(), self._rivals(), self.owed, ~unseen
+        )
 
     def prior(self, candidates: Candidates, cameras: Sequence[str], pixels: Floats) -> Prior:
         """What the positions (N, 2) of lights in those cameras say about which labels they are."""

@@ -43,6 +43,7 @@ class LabelSystemSettings:
     weak_fraction: float = ranged(0.0, minimum=0.0, maximum=1.0, doc="labels whose batteries are nearly empty")
     weak_light: float = ranged(0.4, minimum=0.01, maximum=1.0, doc="how brightly these flash, relative to the others")
     weak_lost_fraction: float = ranged(0.2, minimum=0.0, maximum=1.0, doc="commands that these do not hear")
+    feedback: bool = True  # files that were fetched vanish; false: nothing tells that they were
     clock_error: float = ranged(0.001, minimum=0.0, maximum=0.1, doc="relative rate error of a label's clock, sigma")
 
     def __post_init__(self) -> None:
@@ -95,6 +96,7 @@ class LabelSystem:
         self._free = -math.inf  # when the next command can be sent
         self._flashes: list[list[_Flash]] = [[] for _ in label_ids]
         self._unfinished: dict[str, int] = {}
+        self._fetched: set[str] = set()  # names of files that stay in the folder
         self._snapshot = self._freeze()
 
     async def run(self) -> None:
@@ -104,10 +106,12 @@ class LabelSystem:
             self.scan(now())
 
     def scan(self, t: float) -> None:
-        """Fetch and delete the instruction files that are there at time `t`, in the order of their names."""
+        """Fetch the instruction files that are there at time `t`, in the order of their names, and delete them."""
         found = False
-        for path in sorted(self.folder.glob("*.txt")):
-            if (text := self._fetch(path)) is not None:
+        there = sorted(self.folder.glob("*.txt"))
+        self._fetched &= {path.name for path in there}
+        for path in there:
+            if path.name not in self._fetched and (text := self._fetch(path)) is not None:
                 found = True
                 for line in text.splitlines():
                     self._command(t, line)
@@ -148,7 +152,10 @@ class LabelSystem:
                 if scans < GIVE_UP_SCANS:
                     return None
             self._unfinished.pop(path.name, None)
-            path.unlink()
+            if self.settings.feedback:
+                path.unlink()
+            else:
+                self._fetched.add(path.name)
         except OSError:  # a folder of that name, or somebody else was faster
             return None
         return data.decode("utf-8", "replace")
