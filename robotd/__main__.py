@@ -244,6 +244,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RobotdError as error:
         print(f"robotd: {error}", file=sys.stderr)
         return 1
+    except BrokenPipeError:  # whoever read our output has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
     except KeyboardInterrupt:
         return 130
 

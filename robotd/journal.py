@@ -162,7 +162,7 @@ class Journal(JournalFile):
             row = self.sure.execute("SELECT id FROM surveys WHERE name = ?", (name,)).fetchone()
             if row is None:
                 known = [other for (other,) in self.sure.execute("SELECT name FROM surveys ORDER BY id")]
-                raise InputError(f"{self.path}: no survey {name!r}; there is {', '.join(known) or 'none'}")
+                raise InputError(f"{self.path}: no survey {name!r}; there is {', '.join(known) or 'none yet'}")
         return int(row[0])
 
     def surveys(self) -> dict[str, SurveySummary]:

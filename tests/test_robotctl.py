@@ -57,10 +57,20 @@ def test_status_is_one_screen_and_one_json_object(robot):
     assert max(map(len, lines)) <= 80
     for word in ("robot ", "pose ", "battery ", "base ", "mission ", "uploads ", "driver ", "roomba"):
         assert word in shown.stdout
+    assert re.search(r"^held +no$", shown.stdout, re.M)  # nobody wants to drive, which holds nothing
     status = json.loads(robotctl(robot, "--json", "status").stdout)
     assert status["robot"] == "trial"
     assert status == {**status, "latched": None, "busy": None}
     assert json.loads(robotctl(robot, "status", "--json").stdout).keys() == status.keys()
+
+
+def test_whoever_reads_only_the_first_lines_sees_no_traceback():
+    command = [sys.executable, "-m", "robotd", "config", "schema"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "{\n"
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 0
 
 
 def test_what_the_robot_refuses_is_said_and_has_an_exit_code(robot):

@@ -9,7 +9,17 @@ import sys
 
 from .client import Connection
 from .errors import DONE, REFUSED, USAGE, CtlError
-from .tables import battery_text, mission_text, mode_text, motion_text, pose_text, show_json, table, wrapped
+from .tables import (
+    battery_text,
+    held_text,
+    mission_text,
+    mode_text,
+    motion_text,
+    pose_text,
+    show_json,
+    table,
+    wrapped,
+)
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -55,7 +65,7 @@ def status_text(answer: dict[str, Any]) -> str:
         ("clock", f"{answer['utc'].replace('T', ' ').replace('+00:00', ' UTC')}{clock}"),
         ("pose", pose_text(pose)),
         ("motion", motion_text(pose)),
-        ("held", answer["held"] or "no"),
+        ("held", held_text(answer["held"]) or "no"),
         ("base", mode_text(answer["base"])),
         ("battery", battery_text(answer["base"])),
         ("mission", mission_text(mission)),
@@ -183,7 +193,8 @@ def mission_resume(arguments: Namespace) -> int:
 
 def mission_abort(arguments: Namespace) -> int:
     answer = ask(arguments, "mission.abort")
-    return _say(arguments, answer, f"aborted; {answer['stops']} stops are kept")
+    stops = answer["stops"]
+    return _say(arguments, answer, f"aborted; {stops} stop{' is' if stops == 1 else 's are'} kept")
 
 
 def mission_status(arguments: Namespace) -> int:

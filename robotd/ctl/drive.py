@@ -12,7 +12,7 @@ import time
 
 from .commands import connect
 from .errors import DONE
-from .tables import battery_text, mode_text, motion_text, pose_text, wrapped
+from .tables import battery_text, held_text, mode_text, motion_text, pose_text, wrapped
 from .terminal import Screen
 
 TYPE_CHECKING = False
@@ -117,6 +117,6 @@ def _lines(name: str, stick: Stick, sample: dict[str, Any] | None, told: str, wi
             f"pose     {pose_text(sample['pose'])}",
             f"base     {mode_text(sample['base'])}",
             f"battery  {battery_text(sample['base'])}",
-            *(wrapped(f"held     {sample['held']}", width) if sample["held"] else [""]),
+            *(wrapped(f"held     {held}", width) if (held := held_text(sample["held"])) else [""]),
         ]
     return [*lines, "", *wrapped(told, width)]

@@ -80,6 +80,11 @@ def mode_text(base: dict[str, Any] | None) -> str:
     return ", ".join([f"{base['mode']} mode", *senses])
 
 
+def held_text(cause: str | None) -> str:
+    """Why the wheels are held, "" if nothing holds them but that nobody wants them to turn."""
+    return "" if cause is None or cause.startswith("no drive command") else cause
+
+
 def mission_text(mission: dict[str, Any]) -> str:
     """State, stop and cause in words."""
     parts = [mission["state"]]

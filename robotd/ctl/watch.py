@@ -7,7 +7,7 @@ from collections import deque
 
 from .commands import connect
 from .errors import DONE
-from .tables import battery_text, mission_text, mode_text, wrapped
+from .tables import battery_text, held_text, mission_text, mode_text, wrapped
 from .terminal import Plan, Screen
 
 TYPE_CHECKING = False
@@ -102,8 +102,8 @@ class View:
                 f"driven   {pose['travelled']:7.2f} m",
             ]
         lines += ["", *wrapped(mode_text(base), width), *wrapped(battery_text(base), width)]
-        if sample["held"]:
-            lines += wrapped(f"held: {sample['held']}", width)
+        if held := held_text(sample["held"]):
+            lines += wrapped(f"held: {held}", width)
         lines += ["", *wrapped(mission_text(mission), width)]
         if text := (mission["text"] or mission["ended"]):
             lines += wrapped(text, width)
