@@ -24,9 +24,9 @@ def add_calibrate_camera(kinds: argparse._SubParsersAction[argparse.ArgumentPars
     board.add_argument("--board", type=_inner, metavar="COLSxROWS", help="chessboard: its inner corners, such as 9x6")
     board.add_argument("--charuco", type=_inner, metavar="COLSxROWS", help="ChArUco board: its squares, such as 8x5")
     board.add_argument("--matlab", type=Path, metavar="FILE", help=".mat or .json with toStruct(cameraParams)")
-    camera.add_argument("--square", type=_metres, metavar="M", help="side of a square in metres")
+    camera.add_argument("--square", type=metres, metavar="M", help="side of a square in metres")
     camera.add_argument(
-        "--marker", type=_metres, metavar="M", help="side of a ChArUco marker (default: 3/4 of a square)"
+        "--marker", type=metres, metavar="M", help="side of a ChArUco marker (default: 3/4 of a square)"
     )
     camera.add_argument("--dictionary", default="DICT_4X4_50", metavar="NAME", help="of its markers: DICT_4X4_50, ...")
     camera.add_argument("--size", type=_size, metavar="WxH", help="of the picture, if the MATLAB file lacks it")
@@ -69,7 +69,8 @@ def _pair(text: str, low: int, high: int, wanted: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
-def _metres(text: str) -> float:
+def metres(text: str) -> float:
+    """A length of a board, above 0 and at most 1 m; raises ArgumentTypeError."""
     try:
         value = float(text)
     except ValueError:

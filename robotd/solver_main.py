@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from . import workbench_tool
 from .errors import InputError, RobotdError
-from .lens_commands import add_calibrate_camera
+from .lens_commands import add_calibrate_camera, metres
 from .plan_tool import add_plan
 from .rig_commands import add_calibrate_rig, add_calibrate_time
 from .roof_commands import add_calibrate_roof, add_roof
@@ -126,7 +126,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     )
     floor.add_argument("images", nargs="+", type=Path, metavar="IMAGE", help="pictures with the board on the floor")
     floor.add_argument("--board", type=_board, required=True, metavar="COLSxROWS", help="inner corners, such as 9x6")
-    floor.add_argument("--square", type=_metres, required=True, metavar="M", help="side of a square in metres")
+    floor.add_argument("--square", type=metres, required=True, metavar="M", help="side of a square in metres")
     floor.add_argument(
         "--at",
         action="append",
@@ -136,7 +136,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
         help="middle of the board's inner corners from the robot's centre in metres, x ahead, y to the left; and where"
         " its long side points: 0 along x, 90 along y",
     )
-    floor.add_argument("--at-sigma", type=_metres, default=0.003, metavar="M", help="how sure --at is (default: 0.003)")
+    floor.add_argument("--at-sigma", type=metres, default=0.003, metavar="M", help="how sure --at is (default: 0.003)")
     floor.add_argument(
         "--held",
         nargs="+",
@@ -169,16 +169,6 @@ def _board(text: str) -> tuple[int, int]:
     if columns == rows:
         raise argparse.ArgumentTypeError(f"found {text!r}; a square board looks the same all four ways round")
     return columns, rows
-
-
-def _metres(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value <= 1.0:
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected metres, above 0 and at most 1, such as 0.025")
-    return value
 
 
 def _place(text: str) -> tuple[float, float, float]:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
 from .calibrate_lens import LensCalibration
+from .figure import ARROW, INK, MUTED, RING, new_figure, plain, save_figure
 from .lens_fit import View
-from .report import INK, MUTED
 
 MAGNIFIED = 100.0  # times, the residuals over the view
-ARROW, RING = "#c2410c", "#15803d"
 
 
 def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -> None:
@@ -25,15 +22,10 @@ def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -
     InputError
         If the file cannot be written or matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.patches import Circle
-    except ImportError as error:
-        raise InputError(f"{path}: pictures need matplotlib; install robotd[solver]") from error
-    figure = Figure(figsize=(13, 6.2), dpi=120, facecolor="white")
-    FigureCanvasAgg(figure)
-    name = result.camera.name.replace("$", r"\$")
+    figure = new_figure(path, 13.0, 6.2, 120.0)
+    from matplotlib.patches import Circle
+
+    name = plain(result.camera.name)
     figure.text(0.05, 0.94, f"Lens of {name}: {result.kind}, {result.rms_px:.3f} px rms", size=15, color=INK)
     held = ", ".join(f"{kind} {error:.3f} px" for kind, error in result.held_out_px.items())
     figure.text(0.05, 0.90, f"held out: {held}", size=9.5, color=MUTED)
@@ -62,9 +54,4 @@ def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -
     share.axhline(result.rms_px, color=ARROW, linewidth=1.0)
     share.set(xlabel="picture", ylabel="rms (px)")
 
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    try:
-        path.write_bytes(buffer.getvalue())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    save_figure(path, figure)

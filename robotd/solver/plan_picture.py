@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
 from ..records import Floats
+from .figure import FAINT, INK, MUTED, new_figure, plain, save_figure
 from .planning import Study
-from .report import ESTIMATE, FAINT, INK, MUTED, TRUTH, save_picture
+from .report import ESTIMATE, TRUTH
 from .viewing_angles import force_field, viewing_angles
 
 _AROUND_M = 0.8  # of the stops and labels that is shown
@@ -28,14 +27,8 @@ def draw_plan(path: Path, study: Study) -> None:
     InputError
         If the file cannot be written or matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError(f"{path}: pictures need matplotlib; install robotd[solver]") from error
-    figure = Figure(figsize=(12.5, 6.25), dpi=160, facecolor="white")
-    FigureCanvasAgg(figure)
-    figure.text(0.05, 0.94, f"Next stops of {study.plan.survey[:40]}", size=14, weight="bold", color=INK)
+    figure = new_figure(path, 12.5, 6.25, 160.0)
+    figure.text(0.05, 0.94, f"Next stops of {plain(study.plan.survey[:40])}", size=14, weight="bold", color=INK)
     left, right = figure.add_axes((0.05, 0.08, 0.42, 0.78)), figure.add_axes((0.55, 0.08, 0.42, 0.78))
     stops = np.array([[stop.x, stop.y] for stop in study.map.stops]).reshape(-1, 2)
     there = np.isfinite(study.positions[:, 0])
@@ -50,9 +43,7 @@ def draw_plan(path: Path, study: Study) -> None:
         axes.plot(*stops.T, "s", color=INK, markersize=4, zorder=3)
     _draw_information(left, study, labels, there)
     _draw_angles(right, stops[-1], labels[:, :2], low, high)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    save_picture(path, buffer.getvalue())
+    save_figure(path, figure)
 
 
 def plan_table(study: Study) -> str:

@@ -6,8 +6,7 @@ uncertainty all enter as they do when the survey is solved. Places are taken gre
 then labels are taken off each stop whose flashes together would add next to nothing (thesis section 8.2.2).
 
 A label counts with its standard deviation and with the risk of being wrong: a position on which k stops agree is wrong
-with a probability that falls with k as the share of wrong sightings does. Where the way leads past floor that no stop
-has looked at yet, labels are assumed at the spacing, distance and height of those seen so far.
+with a probability that falls with k as the share of wrong sightings does.
 """
 
 from __future__ import annotations
@@ -18,33 +17,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import SolverError
-from ..geometry.transforms import wrap_angle
 from ..plan_records import Plan, PlannedFlash, PlannedLabel, PlannedStop
 from ..records import Floats, Map, Pose, Survey
 from ..typed_json import many_records
-from .belief import Belief, Rows, Views
+from .belief import Rows
 from .mapping import WIDEST_SIGMA_M, to_map
+from .outlook import Outlook
 from .problem import Ints, build_problem
-from .robust import SLIPPED, Optimum, optimise
-from .ways import along_line, over_floor
+from .robust import SLIPPED, optimise
 
-_MOST_ENTRIES = 6000  # of a dense covariance: 300 MB
 _WRONG_M = 0.5  # error of a position that is wrong
-_LEAST_WRONG, _MOST_WRONG = 0.005, 0.2  # share of sightings
-_SHOWS = 0.9  # probability that a label is seen which nothing is known to hide
-_SIMILAR = np.radians(15.0)  # directions that differ by less are probably hidden by the same things
-_FIELD = np.radians(72.0)  # to either side of its normal in which a label's light shows
-_REACH = 1.1  # times the distance within which 95 % of the sightings lie
 _APART = 0.35  # of the labels' usual distance lies between two stops: nearer ones see them from almost the same side
 _LONGEST = 0.75  # of the reach may lie between two stops: farther apart they share too few labels to be joined
 _JOINING = 6  # labels are asked at each stop, where so many show: one wrong name must not turn the robot's pose
 _AS_SURE = 1.1  # times as uncertain the robot's pose may get by leaving labels out: whatever it sees next inherits that
-_NEGLIGIBLE = 0.05  # labels that one may stand for
-_GUESSES_M = 1.0  # between assumed labels along the way
 _SLIP_EVERY_M = 20.0  # a wheel slips, and then a move says little
 _FLOOR = np.diag([1e-4, 1e-4, 1e-4]) ** 2
-_WHEELS = np.array([3e-5, 3e-5, 4e-4])  # m^2, m^2, rad^2 per metre, of a survey without moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,146 +112,16 @@ def plan(
     with many_records():
         problem = build_problem(survey)
         optimum = optimise(problem)
-        return _Planner(optimum, to_map(problem, optimum), line, free, again, settings or PlanSettings()).study()
+        outlook = Outlook(optimum, to_map(problem, optimum), line, free, again)
+        return _Planner(outlook, settings or PlanSettings()).study()
 
 
 class _Planner:
-    def __init__(
-        self, optimum: Optimum, result: Map, line: Floats | None, free: bool, again: bool, settings: PlanSettings
-    ) -> None:
-        self.optimum, self.map, self.settings = optimum, result, settings
-        problem, s = optimum.problem, optimum.problem.sightings.select(np.flatnonzero(optimum.inlier))
-        if len(s) == 0:
-            raise SolverError(
-                f"survey {problem.survey.survey}: no label has a position yet; make two stops along the line first"
-            )
-        poses = problem.stop_entries(optimum.state)[:, :3]
-        distance = np.hypot(*(poses[s.stop, :2] - optimum.state.points[s.label, :2]).T)
-        self.reach = _REACH * float(np.quantile(distance, 0.95)) + 0.05
-        self.depth = depth = float(np.median(distance))
-        self.stops = poses[:, :2]
-        newest = poses[problem.leg == problem.leg[-1]]
-        if free:
-            self.way = over_floor(newest, optimum.state.points[optimum.adjustment.labels, :2])
-        elif line is None:
-            self.way = along_line(poses[:, :2], newest, poses[0], True, _GUESSES_M)
-        else:
-            self.way = along_line(line, newest, poses[0], again, _GUESSES_M)
-        guesses, weights, facing = self._guesses(poses, depth)
-        if optimum.adjustment.size + 3 * (len(problem.labels) + len(guesses)) > _MOST_ENTRIES:
-            raise SolverError(
-                f"survey {problem.survey.survey}: {len(problem.labels)} labels and {problem.stop_count} stops are too "
-                "many to plan at once; survey the store in parts"
-            )
-        self.belief = Belief(optimum, depth, 0.5 * depth, guesses, max(depth, 0.5))
+    def __init__(self, outlook: Outlook, settings: PlanSettings) -> None:
+        self.outlook, self.settings = outlook, settings
+        self.optimum, self.belief, self.way = outlook.optimum, outlook.belief, outlook.way
+        self.views, self.chance, self.weights = outlook.views, outlook.chance, outlook.weights
         self.places = self.way.places
-        sigma = float(np.median(problem.sightings.sigma))
-        self._directions(poses, facing)
-        past = self.belief.views(poses, sigma, self.reach)
-        self.weights, self.agreeing = self._judged(weights, past)
-        self.belief.points[self.weights == 0.0] = np.nan
-        self.views = self.belief.views(self.places, sigma, self.reach)
-        self.chance = self._chances(poses, past)
-        self._rates = self._wheels()
-        self.doubt = self._doubt()
-
-    # ---- what is known before ------------------------------------------------------------------------------------
-
-    def _guesses(self, poses: Floats, depth: float) -> tuple[Floats, Floats, Floats]:
-        """Where labels may be that no stop has seen: positions (G, 3), how many each stands for, directions (G, 2)."""
-        points = self.optimum.state.points[self.optimum.adjustment.labels]
-        ahead, normals = self.way.floor, self.way.sides
-        passed = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-        weight = 0.5 * _GUESSES_M * len(points) / (passed + 2.0 * depth)
-        where = np.concatenate([ahead + depth * normals, ahead - depth * normals])
-        facing = np.concatenate([-normals, normals])
-        height = float(np.median(points[:, 2]))
-        guesses = np.column_stack([where, np.full(len(where), height)])
-        return guesses, np.full(len(guesses), weight), facing
-
-    def _directions(self, poses: Floats, facing: Floats) -> None:
-        """Unit directions (L, 2) on the plan in which labels seem to look."""
-        s = self.optimum.problem.sightings
-        s = s.select(~self.optimum.reflected)
-        points = self.belief.points
-        away = poses[s.stop, :2] - points[s.label, :2]
-        away /= np.maximum(np.hypot(*away.T), 1e-9)[:, None]
-        total = np.zeros((len(points), 2))
-        np.add.at(total, s.label[np.isfinite(away[:, 0])], away[np.isfinite(away[:, 0])])
-        total[len(points) - len(facing) :] = facing
-        self.facing = total / np.maximum(np.hypot(*total.T), 1e-9)[:, None]
-        turn = _turned(self.facing[s.label], away)
-        first, last = np.full(len(points), np.inf), np.full(len(points), -np.inf)
-        np.minimum.at(first, s.label, turn)
-        np.maximum.at(last, s.label, turn)
-        first[len(points) - len(facing) :], last[len(points) - len(facing) :] = -_FIELD, _FIELD
-        self.seen_from = np.column_stack([first, last])
-
-    def _shows(self, views: Views, places: Floats) -> Floats:
-        """(V,) probability that a place is on the side to which a label looks.
-
-        It shows within `_FIELD` to either side of its normal. Of the normal only this is known, that all places from
-        which the label was seen lie within that.
-        """
-        away = places[views.place, :2] - self.belief.points[views.label, :2]
-        turn = _turned(self.facing[views.label], away)
-        first, last = self.seen_from[views.label].T
-        beyond = np.maximum(np.maximum(first - turn, turn - last), 0.0)
-        return np.asarray(np.clip(1.0 - beyond / np.maximum(2.0 * _FIELD - (last - first), _FIELD / 10.0), 0.0, 1.0))
-
-    def _judged(self, guessed: Floats, past: Views) -> tuple[Floats, Floats]:
-        """How many labels each stands for, and how many stops agree on its position (L,)."""
-        optimum = self.optimum
-        problem = optimum.problem
-        s = problem.sightings.select(np.flatnonzero(optimum.inlier))
-        pairs = np.unique(s.stop * len(problem.labels) + s.label)
-        agreeing = np.bincount(pairs % len(problem.labels), minlength=len(problem.labels)).astype(np.float64)
-        status = {label.label: label.status for label in self.map.labels}
-        sure = np.array([status.get(label) in ("placed", "known") for label in problem.labels], dtype=np.bool_)
-        agreeing[~sure] = np.minimum(agreeing[~sure], 1.0)
-        agreeing[problem.known.label] = 10.0
-        there = np.isfinite(self.belief.points[:, 0])
-        # what was in view of a stop and is there would have been seen
-        looked = np.bincount(past.label, minlength=len(there)) * 1.0
-        missed = (1.0 - _SHOWS) ** looked[len(problem.labels) :]
-        weights = np.concatenate([np.ones(len(problem.labels)), guessed * missed])
-        weights[weights < _NEGLIGIBLE] = 0.0
-        return weights * there, np.concatenate([agreeing, np.zeros(len(guessed))])
-
-    def _chances(self, poses: Floats, past: Views) -> Floats:
-        """(V,) probability that each view shows its label, as far as earlier stops in like directions saw it."""
-        problem, s = self.optimum.problem, self.optimum.problem.sightings
-        seen = np.zeros((problem.stop_count, len(self.belief.points)), dtype=np.bool_)
-        seen[s.stop, s.label] = True
-        expected = np.zeros_like(seen)
-        expected[past.place, past.label] = True
-        expected |= seen
-        points = self.belief.points[:, :2]
-        with np.errstate(invalid="ignore"):
-            bearing = np.arctan2(*(poses[:, None, :2] - points).transpose(2, 0, 1)[::-1])
-            here = np.arctan2(*(self.places[self.views.place, :2] - points[self.views.label]).T[::-1])
-            like = np.exp(-((wrap_angle(bearing[:, self.views.label] - here) / _SIMILAR) ** 2))
-        like = np.where(expected[:, self.views.label], like, 0.0)
-        likely = _SHOWS * self._shows(self.views, self.places)
-        hits = (like * seen[:, self.views.label]).sum(axis=0)
-        exists = np.minimum(self.weights, 1.0)[self.views.label]
-        return np.asarray(exists * (likely + _SHOWS * hits) / (1.0 + like.sum(axis=0)))
-
-    def _wheels(self) -> Floats:
-        """(3,) variance that a move gains per metre."""
-        moves = self.optimum.problem.moves
-        driven = float(np.hypot(*moves.measured[:, :2].T).sum()) if len(moves.measured) else 0.0
-        if driven < 0.1:
-            return _WHEELS
-        return np.asarray(np.diagonal(moves.covariance, axis1=1, axis2=2).sum(axis=0) / driven)
-
-    def _doubt(self) -> float:
-        """Share of sightings that are wrong."""
-        optimum = self.optimum
-        s = optimum.problem.sightings
-        counted = np.isin(s.label, optimum.adjustment.labels) & ~optimum.reflected
-        wrong = (np.count_nonzero(counted & ~optimum.inlier) + 0.5) / (np.count_nonzero(counted) + 1.0)
-        return float(np.clip(wrong, _LEAST_WRONG, _MOST_WRONG))
 
     # ---- what a stop is worth ------------------------------------------------------------------------------------
 
@@ -271,7 +129,7 @@ class _Planner:
         """(L,) what is uncertain about each label, in metres."""
         sigma = np.sqrt(np.maximum(traces, 0.0))
         excess = np.where(sigma > self.settings.target_m, sigma, 0.0)
-        return np.asarray(self.weights * (excess + _WRONG_M * self.doubt ** np.maximum(agreeing - 1.0, 0.0)))
+        return np.asarray(self.weights * (excess + _WRONG_M * self.outlook.doubt ** np.maximum(agreeing - 1.0, 0.0)))
 
     def _agreeing_with(self, agreeing: Floats, rows: Ints) -> Floats:
         """How many stops agree when the labels of some views of one stop are seen from it, too."""
@@ -294,7 +152,7 @@ class _Planner:
         if not before:
             return Rows(np.zeros((0, 1)), np.zeros((0, 1), dtype=np.int64))
         metres, pose, entries = min(before, key=lambda item: item[0])
-        covariance = np.diag(self._rates * metres) + SLIPPED * min(metres / _SLIP_EVERY_M, 1.0) + _FLOOR
+        covariance = np.diag(self.outlook.rates * metres) + SLIPPED * min(metres / _SLIP_EVERY_M, 1.0) + _FLOOR
         return belief.move(pose, entries, self.places[place], entry, covariance)
 
     def _apart(self, along: float, pose: Floats, place: int) -> float:
@@ -330,7 +188,7 @@ class _Planner:
 
     def _grown(self) -> tuple[list[_Choice], Floats]:
         """Take the place that teaches most per second, again and again; and what each place teaches by itself."""
-        belief, settings, agreeing = self.belief, self.settings, self.agreeing
+        belief, settings, agreeing = self.belief, self.settings, self.outlook.agreeing
         P, chosen, gains = belief.P, list[_Choice](), np.zeros(len(self.places))
         now = first = self._total(P, agreeing)
         bound = np.full(len(self.places), np.inf)  # of what a place can be worth per second: that of an earlier round
@@ -368,7 +226,7 @@ class _Planner:
         result: list[_Choice] = []
         at = self.way.here if self.way.here is not None else float(along[chosen[0].place])
         for choice in chosen:
-            pieces = math.ceil(max(float(along[choice.place]) - at, 0.0) / (_LONGEST * self.reach) - 1e-9)
+            pieces = math.ceil(max(float(along[choice.place]) - at, 0.0) / (_LONGEST * self.outlook.reach) - 1e-9)
             for k in range(1, pieces):
                 place = int(np.abs(along - (at + k * (float(along[choice.place]) - at) / pieces)).argmin())
                 result.append(replace(choice, place=place, asked=self.views.at(place)))
@@ -393,7 +251,7 @@ class _Planner:
         if not np.isfinite(at).all() or k == len(chosen) - 1:
             return True
         before = at[k - 1] if k else at[0] if self.way.here is None else self.way.here
-        return bool(at[k + 1] - before <= _LONGEST * self.reach)
+        return bool(at[k + 1] - before <= _LONGEST * self.outlook.reach)
 
     def _sparing(self, chosen: list[_Choice], P: Floats) -> list[_Choice]:
         """Without labels that add next to nothing at a stop.
@@ -401,7 +259,7 @@ class _Planner:
         Each stop is judged by what is known when the robot stands there, not by what later stops could make good: the
         robot may never get there, and a plan that is renewed at every stop would put off every label.
         """
-        agreeing, result = self.agreeing, list[_Choice]()
+        agreeing, result = self.outlook.agreeing, list[_Choice]()
         for choice in chosen:
             room, entry = self.belief.with_stop(P)
             choice = replace(choice, entry=entry, link=self._link(choice.place, result, entry))
@@ -438,11 +296,11 @@ class _Planner:
     def _pose_sigma(self, choice: _Choice, P: Floats) -> float:
         """How uncertain the robot's own place is at a stop, as metres at a label's usual distance."""
         x, y, heading = self.belief.pose_with(self._rows(choice), P, choice.entry)
-        return float(np.sqrt(max(x + y + heading * self.depth**2, 0.0)))
+        return float(np.sqrt(max(x + y + heading * self.outlook.depth**2, 0.0)))
 
     def _with(self, chosen: Sequence[_Choice], P: Floats) -> tuple[Floats, Floats, float]:
         """The joint covariance with some stops made, in that order, who agrees then, and the losses' sum."""
-        agreeing, done = self.agreeing, list[_Choice]()
+        agreeing, done = self.outlook.agreeing, list[_Choice]()
         for choice in chosen:
             P, entry = self.belief.with_stop(P)
             done.append(replace(choice, entry=entry, link=self._link(choice.place, done, entry)))
@@ -455,9 +313,9 @@ class _Planner:
         along, others = self.way.along, [choice.place for choice in chosen]
         if np.isfinite(along[place]):
             there = [*along[others], *(() if self.way.here is None else (self.way.here,))]
-            return any(abs(float(along[place]) - at) < _APART * self.depth for at in there)
-        apart = np.hypot(*(np.concatenate([self.places[others, :2], self.stops]) - self.places[place, :2]).T)
-        return bool((apart < _APART * self.depth).any())
+            return any(abs(float(along[place]) - at) < _APART * self.outlook.depth for at in there)
+        apart = np.hypot(*(np.concatenate([self.places[others, :2], self.outlook.stops]) - self.places[place, :2]).T)
+        return bool((apart < _APART * self.outlook.depth).any())
 
     def _is_done(self, P: Floats, agreeing: Floats) -> bool:
         judged = self.weights > 0.0
@@ -475,7 +333,7 @@ class _Planner:
         belief, problem, way = self.belief, self.optimum.problem, self.way
         count = len(problem.labels)
         flashes, skipped = list[tuple[PlannedFlash, ...]](), list[tuple[str, ...]]()
-        P, agreeing = first, self.agreeing
+        P, agreeing = first, self.outlook.agreeing
         for k, choice in enumerate(at):
             P, agreeing, _ = self._with(at[: k + 1], first)
             sigma = np.sqrt(belief.traces(P))
@@ -494,7 +352,7 @@ class _Planner:
         )
         now = {
             label.label: None if label.covariance is None else float(np.sqrt(np.trace(np.array(label.covariance))))
-            for label in self.map.labels
+            for label in self.outlook.map.labels
             if label.status in ("placed", "known")
         }
         expected = np.sqrt(np.maximum(belief.traces(P), 0.0))
@@ -508,7 +366,7 @@ class _Planner:
         result = Plan(problem.survey.survey, stops, labels_, notes, begin)
         return Study(
             result,
-            self.map,
+            self.outlook.map,
             self.places,
             gains,
             belief.points[:count],
@@ -540,9 +398,3 @@ class _Planner:
         if self.way.here is None:
             notes.append("the stops are for a new leg, from the line's beginning")
         return tuple(notes)
-
-
-def _turned(directions: Floats, vectors: Floats) -> Floats:
-    """(K,) angles from unit directions (K, 2) to vectors (K, 2), counter-clockwise."""
-    (a, b), (x, y) = directions.T, vectors.T
-    return np.asarray(np.arctan2(a * y - b * x, a * x + b * y))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import io
 import json
 import math
 import textwrap
@@ -15,15 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotd.errors import InputError
 from robotd.geometry.transforms import wrap_angle
 from robotd.records import Floats, Map, MappedLabel, MappedStop, Survey, Vector3
+
+from .figure import FAINT, INK, MUTED, new_figure, save_figure, save_picture
 
 CHI2_95 = {2: 5.991, 3: 7.815}  # 95 % quantiles of chi squared, by degrees of freedom
 GRID = 0.5  # m
 MANY = 120  # labels or stops: beyond it names would only cover one another
 
-INK, MUTED, FAINT, WALL = "#1c2127", "#6b7480", "#e3e6ea", "#c3c9d1"
+WALL = "#c3c9d1"
 LINE = "#b9b1a3"
 ESTIMATE, TRUTH, ODOMETRY, ADJUSTED = "#f08a12", "#c2183a", "#4a7bd0", "#0a7d6c"
 
@@ -112,13 +112,8 @@ def map_png(
     InputError
         If the file cannot be written or matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError(f"{path}: pictures need matplotlib; install robotd[solver]") from error
-    figure = Figure(figsize=(10, 7.5), dpi=160, facecolor="white")
-    FigureCanvasAgg(figure)
+    path = Path(path)
+    figure = new_figure(path, 10.0, 7.5, 160.0)
     axes = figure.add_axes((0.06, 0.065, 0.66, 0.835))
     figure.text(0.06, 0.955, f"Map of {_plain(result.survey, 40)}", size=16, weight="bold", color=INK)
     method = {"bundle": "bundle adjustment", "linear": "linear triangulation"}[result.solver.method]
@@ -148,9 +143,7 @@ def map_png(
     if errors:
         lowest = _draw_errors(figure, np.array(list(errors.values())), lowest)
     _draw_unplaced(figure, [label for label in result.labels if label.status not in ("placed", "known")], lowest)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    save_picture(path, buffer.getvalue())
+    save_figure(path, figure)
 
 
 def _plain(text: str, length: int) -> str:
@@ -465,11 +458,3 @@ def _axes(label: MappedLabel) -> list[list[float]] | None:
     values, vectors = np.linalg.eigh(np.array(label.covariance))
     half = vectors * np.sqrt(CHI2_95[3] * np.maximum(values, 0.0))
     return [[float(f"{value:.4g}") for value in column] for column in half.T]
-
-
-def save_picture(path: str | Path, data: bytes) -> None:
-    """Write a picture or page; raises InputError if that fails."""
-    try:
-        Path(path).write_bytes(data)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error

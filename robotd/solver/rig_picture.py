@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
 from ..geometry.transforms import rotation_matrix
 from .calibrate_rig import CameraFit, RigCalibration
-from .report import INK, MUTED
+from .figure import ARROW, INK, MUTED, RING, new_figure, plain, save_figure
 
 MAGNIFIED = 200.0  # times, the residuals over a view
-ARROW, RING = "#c2410c", "#15803d"
 _SPREAD = 20.0  # times, the standard deviations from above
 _LOOK_M = 0.04  # length of a viewing direction
 _MOST_ARROWS = 2000
@@ -27,16 +24,11 @@ def draw_rig(path: Path, result: RigCalibration) -> None:
     InputError
         If the file cannot be written or matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.patches import Circle
-    except ImportError as error:
-        raise InputError(f"{path}: pictures need matplotlib; install robotd[solver]") from error
     columns = min(len(result.cameras), 3) + 1
     rows = -(-len(result.cameras) // (columns - 1))
-    figure = Figure(figsize=(4.4 * columns, 3.9 * rows + 1.0), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(path, 4.4 * columns, 3.9 * rows + 1.0, 110.0)
+    from matplotlib.patches import Circle
+
     figure.suptitle(
         f"Rig of {len(result.cameras)} cameras: {result.stops} stops, {result.known} known labels", size=15, color=INK
     )
@@ -47,10 +39,10 @@ def draw_rig(path: Path, result: RigCalibration) -> None:
         top.annotate("", (x + look[0], y + look[1]), (x, y), arrowprops={"arrowstyle": "->", "color": INK})
         top.update_datalim([(x + look[0], y + look[1])])  # an annotation beyond the axes would not be drawn
         top.add_patch(Circle((x, y), _SPREAD * camera.rig_sigma[1], fill=False, color=RING, linewidth=1.6))
-        top.annotate(_plain(camera.model.name), (x, y), xytext=(4, -12), textcoords="offset points", color=INK)
+        top.annotate(plain(camera.model.name), (x, y), xytext=(4, -12), textcoords="offset points", color=INK)
     for name, (x, y, _) in result.beacons.items():
         top.plot(x, y, "*", color=ARROW)
-        top.annotate(_plain(name), (x, y), xytext=(4, 4), textcoords="offset points", color=ARROW)
+        top.annotate(plain(name), (x, y), xytext=(4, 4), textcoords="offset points", color=ARROW)
     top.plot(0.0, 0.0, "+", color=MUTED, markersize=10)
     top.margins(0.15)
     top.autoscale_view()
@@ -61,12 +53,7 @@ def draw_rig(path: Path, result: RigCalibration) -> None:
         place = figure.add_subplot(rows, columns, k // (columns - 1) * columns + k % (columns - 1) + 2)
         _draw_view(place, camera)
     figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.96))
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    try:
-        path.write_bytes(buffer.getvalue())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    save_figure(path, figure)
 
 
 def _draw_view(place: object, camera: CameraFit) -> None:
@@ -81,12 +68,8 @@ def _draw_view(place: object, camera: CameraFit) -> None:
     place.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
     turn, shift = camera.rig_sigma
     place.set_title(
-        f"{_plain(camera.model.name)}: {camera.rms_px:.2f} px rms (x {MAGNIFIED:.0f}); +- {np.degrees(turn):.3f} deg,"
+        f"{plain(camera.model.name)}: {camera.rms_px:.2f} px rms (x {MAGNIFIED:.0f}); +- {np.degrees(turn):.3f} deg,"
         f" {1e3 * shift:.2f} mm",
         size=9.5,
         color=INK,
     )
-
-
-def _plain(name: str) -> str:
-    return name.replace("$", r"\$")

@@ -1,0 +1,50 @@
+"""Figures without a screen, for the pictures that people look at: matplotlib is loaded only when one is drawn."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+
+INK, MUTED, FAINT = "#1c2127", "#6b7480", "#e3e6ea"
+ARROW, RING = "#c2410c", "#15803d"
+
+
+def new_figure(path: Path, width: float, height: float, dpi: float) -> Any:
+    """A white matplotlib figure of so many inches that is to become the file `path`.
+
+    Raises
+    ------
+    InputError
+        If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise InputError(f"{path}: pictures need matplotlib; install robotd[solver]") from error
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(path: Path, figure: Any) -> None:
+    """Write it as PNG; raises InputError if that cannot be written."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    save_picture(path, buffer.getvalue())
+
+
+def save_picture(path: str | Path, data: bytes) -> None:
+    """Write a picture or page; raises InputError if that fails."""
+    try:
+        Path(path).write_bytes(data)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def plain(name: str) -> str:
+    """Text as it stands: matplotlib would read dollar signs as mathematics."""
+    return name.replace("$", r"\$")
