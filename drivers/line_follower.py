@@ -130,7 +130,6 @@ class LineFollowerDriver(Driver):
             )
         )
         self._lost = LostLine()
-        self._told = False
         self._steering: Steering | None = None
         self._forget()
 
@@ -162,10 +161,6 @@ class LineFollowerDriver(Driver):
         """Nothing by itself: the mission calls `follow`."""
         await asyncio.Event().wait()
 
-    def stop_here(self) -> None:
-        """Have `follow` halt now and return "told"."""
-        self._told = True
-
     async def follow(self, travelled: float, *, at_marker: bool = False) -> FollowEnd:
         """Drive along the line until odometry says `travelled` metres (inf: without end), then halt.
 
@@ -178,8 +173,8 @@ class LineFollowerDriver(Driver):
 
         Returns
         -------
-        "distance", "marker", "end" or "told"
-            Why it halted: there, at a marker, at the line's end, or because of `stop_here`.
+        "distance", "marker" or "end"
+            Why it halted: there, at a marker, or at the line's end.
 
         Raises
         ------
@@ -189,7 +184,7 @@ class LineFollowerDriver(Driver):
         self._follower.reset()
         self._lost.start()
         self._eye.forget()
-        self._told, self._doubt = False, None
+        self._doubt = None
         with self.bus.frames(self.config.camera).subscribe(size=2) as frames:
             watching = asyncio.create_task(self._watch(frames, marks=at_marker))
             try:
@@ -211,7 +206,7 @@ class LineFollowerDriver(Driver):
         with self.bus.odometry.subscribe(size=4) as odometry:
             async for state in odometry:
                 if watching.done():
-                    return "told"
+                    watching.result()
                 self._history.add(state.t, state.pose)
                 dt, before = min(max(state.t - before, 0.0), 0.1), state.t
                 if self._doubt is not None and now() - self._doubt[0] >= BLIND_S:
@@ -234,7 +229,7 @@ class LineFollowerDriver(Driver):
     ) -> tuple[Steering, FollowEnd | None]:
         """What to do in this tick, and why the robot is to stand, if it is."""
         tracker, path = self.tracker, self.tracker.path
-        remaining, reason = (0.0, "told") if self._told else (travelled - state.travelled, "distance")
+        remaining, reason = travelled - state.travelled, "distance"
         if at_marker and (to_mark := self._to_mark(path, state)) < remaining:
             remaining, reason = to_mark, "marker"
         lost = tracker.lost(state.travelled)

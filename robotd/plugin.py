@@ -126,7 +126,7 @@ class ListsLabels(Protocol):
         """Its list of labels, as `label_list.read_labels` takes it; raises DriverFault."""
 
 
-FollowEnd = Literal["distance", "marker", "end", "told"]
+FollowEnd = Literal["distance", "marker", "end"]
 
 
 @runtime_checkable
@@ -144,15 +144,12 @@ class Follower(Protocol):
     async def follow(self, travelled: float, *, at_marker: bool = False) -> FollowEnd:
         """Drive along the line until `bus.odometry` says `travelled` metres since the leg began, then halt.
 
-        With `travelled` inf it goes on until told to stop. With `at_marker` it halts at the next marker beside the
+        With `travelled` inf it goes on without end. With `at_marker` it halts at the next marker beside the
         line, too, and the line's end is a stop and no error. Returns why it halted.
 
         Raises MissionError when the line is lost or ends; the robot stands still then, because the follower has
         published a Withdrawal that says so.
         """
-
-    def stop_here(self) -> None:
-        """Have `follow` halt now and return "told": for a planner that decides on the way."""
 
 
 def available() -> dict[str, EntryPoint]:

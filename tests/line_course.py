@@ -90,7 +90,7 @@ def _halved(camera):
     return dataclasses.replace(camera, size=(width // 2, height // 2), matrix=matrix)
 
 
-async def _drive(layout, targets, *, settings, seed, config, spoil, at_marker, camera, limits, until, halved):
+async def _drive(layout, targets, *, settings, seed, config, spoil, at_marker, camera, limits, halved):
     with tempfile.TemporaryDirectory() as folder:
         world = World(layout, settings, seed, Path(folder))
         if halved:
@@ -118,8 +118,6 @@ async def _drive(layout, targets, *, settings, seed, config, spoil, at_marker, c
             try:
                 for target in targets:
                     drive.target = target
-                    if until is not None:
-                        until(asyncio.get_running_loop(), follower)
                     async with asyncio.timeout(LONGEST_S):
                         ended = await follower.follow(target, at_marker=at_marker)
                     drive.stops.append((ended, bus.odometry.latest.travelled, world.body.pose))
@@ -175,7 +173,6 @@ def drive(
     at_marker=False,
     camera="floor",
     limits=None,
-    until=None,
     halved=False,
     **keys,
 ):
@@ -196,7 +193,6 @@ def drive(
             at_marker=at_marker,
             camera=camera,
             limits=limits or SafetyLimits(),
-            until=until,
             halved=halved,
         )
     )

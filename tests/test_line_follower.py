@@ -86,13 +86,6 @@ def test_the_front_camera_of_the_rig_does_instead_of_a_floor_camera():
     assert result.cross_track["rms"] < 20.0
 
 
-def test_a_planner_may_stop_the_robot_on_the_way():
-    layout, _ = store([(0.0, 0.0), (1.5, 0.0)], texture="concrete")
-    result = drive(layout, [math.inf], until=lambda loop, follower: loop.call_later(1.0, follower.stop_here))
-    assert [reason for reason, _, _ in result.stops] == ["told"]
-    assert 0.05 < result.travelled < 0.5
-
-
 # ---- the path to drive -----------------------------------------------------------------------------------------------
 
 RIGHT_ANGLE = np.array([(-0.5, 0.0), (0.6, 0.0), (0.6, 0.9)])
