@@ -61,11 +61,10 @@ class ManualDriver(Driver):
         self, answers: Subscription[Answer], labels: Sequence[str], strength: float, durations: Sequence[int]
     ) -> Sequence[str]:
         """Ask for these labels until the answer makes sense; returns those that were skipped."""
-        self._number += 1
         wanted = ", ".join(f"{label} for {duration} s" for label, duration in zip(labels, durations, strict=True))
         level = "" if strength == 1.0 else f" at {100 * strength:.0f} % brightness"
         text = f"have these flash now{level}, in this order: {wanted}; then answer 'done', or 'skip' and their ids"
-        self.bus.prompts.publish(Prompt(now(), self.name, self._number, text))
+        self._say(text)
         try:
             async with asyncio.timeout(self.config.patience_s):
                 while True:
@@ -77,13 +76,18 @@ class ManualDriver(Driver):
                         return ()
                     if word == "skip" and set(ids) <= set(labels):
                         return ids or labels
-                    self.report(
-                        f"'{answer.text}' was not understood; expected 'done', or 'skip' and ids that were asked for",
-                        "warning",
-                    )
+                    unclear = f"'{answer.text}' was not understood; expected 'done', or 'skip' and ids of these labels"
+                    self.report(unclear, "warning")
+                    self._say(f"{unclear}; {text}")
         except TimeoutError:
             fault = f"{self.name}: nobody answered within {self.config.patience_s:g} s: {text}"
             if not self._broken.done():
                 self._broken.set_exception(DriverFault(fault))
                 self._broken.exception()  # it need not be fetched: the caller has its own
             raise DriverFault(fault) from None
+        finally:
+            self._say("")  # whoever comes now is not to trigger what nobody watches any more
+
+    def _say(self, text: str) -> None:
+        self._number += 1
+        self.bus.prompts.publish(Prompt(now(), self.name, self._number, text))

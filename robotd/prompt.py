@@ -33,7 +33,7 @@ async def converse(bus: Bus, terminal: int, show: Callable[[str], object]) -> No
                 *lines, rest = (rest + data).split(b"\n")
                 for line in lines:
                     prompt = bus.prompts.latest
-                    if prompt is None:
+                    if prompt is None or not prompt.text:
                         show("nothing is asked at present")
                         continue
                     text = line.decode(errors="replace").strip() or "done"
@@ -46,7 +46,8 @@ async def converse(bus: Bus, terminal: int, show: Callable[[str], object]) -> No
 async def _show(bus: Bus, show: Callable[[str], object]) -> None:
     with bus.prompts.subscribe() as prompts:
         async for prompt in prompts:
-            show(f"{prompt.source}: {prompt.text}")
+            if prompt.text:
+                show(f"{prompt.source}: {prompt.text}")
 
 
 def _read(terminal: int) -> bytes:

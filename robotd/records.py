@@ -295,7 +295,10 @@ class LinePoints:
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """A driver asks a person to do something; `number` is unique among the source's prompts of one run."""
+    """A driver asks a person to do something; `number` is unique among the source's prompts of one run.
+
+    An empty `text` takes back what the source asked before.
+    """
 
     t: float
     source: str

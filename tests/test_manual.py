@@ -26,7 +26,8 @@ async def person(bus, *replies, after=2.0):
     texts = []
     with bus.prompts.subscribe() as prompts:
         for reply in replies:
-            prompt = await prompts.get()
+            while not (prompt := await prompts.get()).text:
+                pass  # the one before is taken back
             texts.append(prompt.text)
             await asyncio.sleep(after)
             bus.answers.publish(Answer(now(), prompt.source, prompt.number, reply))
@@ -77,16 +78,21 @@ def test_an_answer_that_makes_no_sense_is_reported_and_the_prompt_stays():
             work = asyncio.create_task(driver.flash(["A1"], 0.5, [3]))
             await asyncio.sleep(1.0)
             assert "at 50 % brightness" in driver.bus.prompts.latest.text
-            for text in ("skip B7", "what", "done now"):
-                driver.bus.answers.publish(Answer(now(), "labels", 1, text))
+            for number, text in enumerate(("skip B7", "what", "done now"), start=1):
+                driver.bus.answers.publish(Answer(now(), "labels", number, text))
                 await asyncio.sleep(1.0)
                 assert f"'{text}' was not understood" in (await events.get()).text
+                asked = driver.bus.prompts.latest  # anew: it would look answered
+                assert asked.number == number + 1
+                assert asked.text.startswith(f"'{text}' was not understood; expected 'done'")
+                assert asked.text.endswith("then answer 'done', or 'skip' and their ids")
             driver.bus.answers.publish(Answer(now(), "labels", 7, "done"))  # of another prompt
-            driver.bus.answers.publish(Answer(now(), "other", 1, "done"))
+            driver.bus.answers.publish(Answer(now(), "other", 4, "done"))
             await asyncio.sleep(1.0)
             assert not work.done()
-            driver.bus.answers.publish(Answer(now(), "labels", 1, ""))
+            driver.bus.answers.publish(Answer(now(), "labels", 4, ""))
             assert await work == {}
+            assert driver.bus.prompts.latest.text == ""  # nothing is asked any more
 
     run_virtual(run())
 
@@ -102,6 +108,7 @@ def test_without_an_answer_the_driver_is_at_fault():
         with pytest.raises(DriverFault, match="nobody answered"):
             await watch
         assert now() == 30.0
+        assert driver.bus.prompts.latest.text == ""
         await driver.close()
 
     run_virtual(run())

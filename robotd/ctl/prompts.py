@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import queue
 import sys
+import threading
 import time
 
 from .commands import ask, connect
-from .errors import DONE
+from .errors import DONE, REFUSED, CtlError
 from .tables import show_json
 
 TYPE_CHECKING = False
@@ -40,13 +42,39 @@ def answer(arguments: Namespace) -> int:
 
 
 def _converse(arguments: Namespace) -> int:
+    lines: queue.Queue[str] = queue.Queue()
+    threading.Thread(target=_type, args=(lines,), daemon=True).start()
+    shown = None  # source and number of the prompt on the screen
     with connect(arguments) as robot:
         while True:
-            for prompt in robot.call("prompts.list", None)["prompts"]:
-                print(f"{prompt['source']}: {prompt['text']}", flush=True)
-                line = sys.stdin.readline()
-                if not line:
-                    return DONE
-                said = {"text": line, "source": prompt["source"], "number": prompt["number"]}
-                robot.call("prompts.answer", said)
-            time.sleep(LOOK_S)
+            asked = next(iter(robot.call("prompts.list", None)["prompts"]), None)
+            if asked is not None and shown != (asked["source"], asked["number"]):
+                print(f"{asked['source']}: {asked['text']}", flush=True)
+                shown = asked["source"], asked["number"]
+            if shown is None and not sys.stdin.isatty():  # a script's lines are for the prompts to come
+                time.sleep(LOOK_S)
+                continue
+            try:
+                line = lines.get(timeout=LOOK_S)
+            except queue.Empty:
+                continue
+            if not line:
+                return DONE
+            if shown is None:
+                print("nothing is asked at present", flush=True)
+                continue
+            try:
+                robot.call("prompts.answer", {"text": line, "source": shown[0], "number": shown[1]})
+            except CtlError as error:
+                if error.code != REFUSED:
+                    raise
+                print(error, flush=True)  # it was answered elsewhere, or nobody waits for it any more
+            shown = None
+
+
+def _type(lines: queue.Queue[str]) -> None:
+    """Hand on what is typed, line by line, and "" at its end."""
+    line = "begin"
+    while line:
+        line = sys.stdin.readline()
+        lines.put(line)

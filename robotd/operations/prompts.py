@@ -27,7 +27,10 @@ class Said:
 def listing(operations: Operations, client: Client, _: Nothing) -> Any:
     """What is asked at present: nothing, or the latest prompt that nobody has answered."""
     prompt, answer = operations.bus.prompts.latest, operations.bus.answers.latest
-    if prompt is None or (answer is not None and (answer.source, answer.number) == (prompt.source, prompt.number)):
+    answered = (
+        answer is not None and prompt is not None and (answer.source, answer.number) == (prompt.source, prompt.number)
+    )
+    if prompt is None or not prompt.text or answered:
         return {"prompts": []}
     asked = {"source": prompt.source, "number": prompt.number, "text": prompt.text, "age_s": now() - prompt.t}
     return {"prompts": [asked]}
@@ -37,7 +40,7 @@ def listing(operations: Operations, client: Client, _: Nothing) -> Any:
 def answer(operations: Operations, client: Client, said: Said) -> Any:
     """Hand the words to the driver that asked; it warns if it does not understand them, and they may be said anew."""
     prompt = operations.bus.prompts.latest
-    if prompt is None:
+    if prompt is None or not prompt.text:
         raise RpcError(rpc.REFUSED, "nothing is asked at present")
     if said.source not in (None, prompt.source) or said.number not in (None, prompt.number):
         raise RpcError(rpc.REFUSED, f"that is not asked any more; at present {prompt.source} asks: {prompt.text}")
