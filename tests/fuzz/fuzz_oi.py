@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of what parses bytes from a serial line, about it, from operators or files, with atheris.
+"""Coverage-guided fuzzing of what parses bytes from a line, from operators, robots or files, with atheris.
 
     python -m tests.fuzz.fuzz_oi --seconds 30            every target, one after the other, sharing that time
     python -m tests.fuzz.fuzz_oi --target stream FILE    what a saved input does
@@ -10,6 +10,9 @@ with the name of the file that holds the input, and the exit code is 1.
 from __future__ import annotations
 
 import argparse
+import asyncio
+import base64
+import hashlib
 import importlib.util
 import json
 import math
@@ -208,6 +211,88 @@ def survey(data: bytes) -> None:
         assert label.position is not None or label.reason
 
 
+class _Server:
+    """The server's application on a folder of its own, without sockets and without maps."""
+
+    def __init__(self) -> None:
+        from robotd.server.app import create_app
+        from robotd.server.recordings import RecordingStore
+        from robotd.server.store import Store
+
+        self._folder = tempfile.TemporaryDirectory()
+        data = Path(self._folder.name)
+        self.store = Store(data)
+        self._app = create_app(self.store, None, jobs=self, recordings=RecordingStore(data, 1 << 20, keep_free=0))  # type: ignore[arg-type]
+        self._loop = asyncio.new_event_loop()
+
+    def begin(self, survey: str) -> None:
+        """No map is made."""
+
+    def put(self, path: str, headers: dict[str, bytes], body: bytes) -> tuple[int, Any]:
+        """Status and JSON of the answer."""
+        sent: list[dict[str, Any]] = []
+        half = len(body) // 2
+        pieces = [(body[:half], True), (body[half:], False)]
+
+        async def receive() -> dict[str, Any]:
+            piece, more = pieces.pop(0)
+            return {"type": "http.request", "body": piece, "more_body": more}
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        scope = {
+            "type": "http",
+            "method": "PUT",
+            "path": path,
+            "raw_path": path.encode(),
+            "query_string": b"",
+            "scheme": "http",
+            "http_version": "1.1",
+            "root_path": "",
+            "client": None,
+            "server": ("x", 1),
+            "headers": [(name.encode(), value) for name, value in headers.items()],
+        }
+        self._loop.run_until_complete(self._app(scope, receive, send))
+        text = b"".join(message.get("body", b"") for message in sent)
+        return sent[0]["status"], json.loads(text) if text else None
+
+
+_servers: list[_Server] = []
+
+
+def upload(data: bytes) -> None:
+    """Whatever is sent to the server is kept or refused in words, and what it kept can be read."""
+    if len(data) < 4:
+        return
+    if not _servers:
+        _servers.append(_Server())
+    server = _servers[0]
+    kind, size, number = data[0], data[1] % 32, data[2]
+    name, rest = data[3 : 3 + size].decode(errors="replace"), data[3 + size :]
+    body = rest
+    if kind & 8:
+        table = json.loads(_damaged(rest))
+        body = json.dumps(table.get("stops", [{}])[0] if kind & 1 and table.get("stops") else table).encode()
+    survey = f"/api/surveys/{name}"
+    path = (survey, f"{survey}/legs/1/stops/{number}", f"/api/recordings/{name}", f"/api/{name}")[kind % 4]
+    headers = {
+        "content-range": b"bytes 0-%d/%d" % (len(body) - 1, len(body) + number % 3),
+        "repr-digest": b"sha-256=:%s:" % base64.b64encode(hashlib.sha256(body).digest()),
+    }
+    if kind & 16:
+        headers["content-digest"] = headers["repr-digest"] if kind & 32 else b"sha-256=:" + rest[:60] + b":"
+    if kind & 64:
+        headers |= {"if-match": rest[:64], "content-range": rest[:40]}
+    status, answer = server.put(path, headers, body)
+    assert status < 500, answer
+    assert status < 300 or status == 307 or answer["problems"], (status, answer)  # 307: a slash too many
+    if status < 300:
+        for known in server.store.surveys():
+            server.store.survey(known)
+
+
 def _damaged(data: bytes) -> bytes:
     """A small survey in which every three bytes spoil one value."""
     table = json.loads(SURVEY.read_bytes())
@@ -247,6 +332,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "recording": recording,
     "control": control,
     "survey": survey,
+    "upload": upload,
 }
 
 
@@ -273,6 +359,12 @@ def _seeds(target: str) -> list[bytes]:
         ]
     if target == "guardian":
         return [b"open 115200 /dev/ttyUSB0", b"beat", b"open x y"]
+    if target == "upload":
+        return [
+            bytes((kind, 4, 1)) + b"room" + body
+            for kind in (0, 1, 2, 9, 8, 24, 57, 74)
+            for body in (b"", b"{}", b"\0\0\0")
+        ]
     if target == "survey":
         return [b"", b"\x00\x00\x00", b'{"format": "robotd-survey/1"}', *(bytes((k, 40 * k, k)) for k in range(1, 7))]
     if target == "control":
@@ -303,6 +395,7 @@ def _run(target: str, seconds: float, files: list[str]) -> None:
             "robotd.bind",
             "robotd.files",
             "robotd.survey_checks",
+            "robotd.server",
         ]
     ):
         import robotd.bind
@@ -310,7 +403,8 @@ def _run(target: str, seconds: float, files: list[str]) -> None:
         import robotd.oi
         import robotd.roomba.firmware
         import robotd.rpc
-        import robotd.serial_log  # noqa: F401
+        import robotd.serial_log
+        import robotd.server.app  # noqa: F401
     with tempfile.TemporaryDirectory() as corpus:
         for number, seed in enumerate(_seeds(target)):
             (Path(corpus) / str(number)).write_bytes(seed)
