@@ -10,11 +10,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 from .. import oi
-from ..bind import ranged
 from ..bus import Bus
 from ..clock import now
 from ..config import Calibration
@@ -26,7 +23,8 @@ from ..roomba.battery import BatteryWatch, charge_fraction
 from ..roomba.encoders import WheelEncoders
 from ..roomba.firmware import Firmware, keep_alive_s
 from ..roomba.line import START_S, LineCounters, RoombaLine
-from ..roomba.modes import ON_CHARGER, SETTLE_S, ModeReader, cliffs, hazards, is_charging, is_docked
+from ..roomba.modes import ON_CHARGER, SETTLE_S, ModeReader, cliffs, hazards, is_charging, is_docked, tells_new
+from ..roomba.settings import RoombaConfig
 from ..roomba.slip import SlipDetector
 from ..roomba.speeds import WheelSpeeds, wheel_speeds
 from ..roomba.wake import WakeLine
@@ -44,29 +42,9 @@ SELF_MOVED_S, SELF_MOVED = 1.0, 0.05  # s in Passive mode, m/s: nobody pushes bo
 TRY_AGAIN_S = 5.0  # between two tries to stop what the robot does by itself, or to reach one that does not obey
 REST_AFTER_S = 5.0  # in Passive mode
 REST_S = 0.075  # then frames are looked at in bunches of six or seven: 66 times a second would cost a Pi 6 % of a core
-TELLING = (7, 9, 10, 11, 12, 14, 18, 21, 34, 35, 43, 44)  # packets of which every change counts, also at rest
 AGAIN_S = 30.0  # until the same kind of trouble is told again
 ZERO = oi.encode("drive_direct", 0, 0)
 START, SAFE, STOP = oi.encode("start"), oi.encode("safe"), oi.encode("stop")
-
-
-@dataclass(frozen=True, slots=True)
-class RoombaConfig:
-    """[drivers.<instance>] of a Roomba."""
-
-    port: str
-    baud: Literal[115200, 57600, 19200] = 115200
-    checksum: Literal["auto", "inclusive", "exclusive"] = "auto"
-    encoders: Literal["auto", "normal", "swapped"] = "auto"
-    rearm: Literal["always", "when_clear", "never"] = "when_clear"
-    disarm_s: float = ranged(120.0, minimum=1.0, maximum=86400.0)
-    speed_step: float = ranged(0.0285, minimum=0.0, maximum=0.1)
-    wake_pin: int | None = ranged(None, minimum=0, maximum=53)
-    wake_polarity: Literal["low", "high"] = "low"
-    dock_s: float = ranged(120.0, minimum=5.0, maximum=3600.0)
-    leave_dock: bool = False
-    low_charge: float = ranged(0.15, minimum=0.0, maximum=1.0)
-    low_voltage: float = ranged(13.0, minimum=0.0, maximum=20.0)
 
 
 class RoombaDriver(Driver):
@@ -176,7 +154,7 @@ class RoombaDriver(Driver):
     def _take_all(self, line: RoombaLine, frames: list[tuple[float, Mapping[int, int]]]) -> None:
         last = len(frames) - 1
         for k, (t, values) in enumerate(frames):
-            if k == last or not self._rests or _tells_new(values, self._values):
+            if k == last or not self._rests or tells_new(values, self._values):
                 self._take(t, values)
         self._decide(line)
 
@@ -521,7 +499,3 @@ class RoombaDriver(Driver):
                 self.report("the robot restarted by itself", "warning")
             else:
                 self.report("the robot says that it goes to sleep", "warning")
-
-
-def _tells_new(values: Mapping[int, int], before: Mapping[int, int]) -> bool:
-    return any(values.get(key) != before.get(key) for key in TELLING)

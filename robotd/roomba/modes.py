@@ -20,6 +20,12 @@ ECHO_S = 0.15  # a drive command is echoed (packets 41, 42) long before
 BUTTONS = ("Clean", "Spot", "Dock", "Minute", "Hour", "Day", "Schedule", "Clock")  # bits 0..7 of packet 18
 _CLIFFS = ((9, "left"), (10, "front left"), (11, "front right"), (12, "right"))
 ON_CHARGER = "it is on the charger"
+TELLING = (7, 9, 10, 11, 12, 14, 18, 21, 34, 35, 43, 44)  # packets of which every change counts, also at rest
+
+
+def tells_new(values: Mapping[int, int], before: Mapping[int, int]) -> bool:
+    """Whether a frame says more than the one before about what the robot does, or what is done to it."""
+    return any(values.get(key) != before.get(key) for key in TELLING)
 
 
 def is_charging(values: Mapping[int, int]) -> bool:
