@@ -28,12 +28,13 @@ from robotd.records import (
     OdometryState,
     Withdrawal,
 )
-from robotd.vision.line_eye import LineEye
+from robotd.vision.line_eye import SURE_CONFIDENCE, LineEye
 from robotd.vision.line_tracker import LineTracker, PoseHistory, TrackerConfig
 from robotd.vision.markers import MarkFinder, MarkTracker
 from robotd.vision.polyline import arc_length
 
 FIRST_SIGHT_S = 3.0  # a standing robot waits this long for a line
+OTHER_WIDTH_S = 1.0  # after so long it may also be wider or narrower than the configuration says
 STANDSTILL_M_S = 0.002
 STANDSTILL_S = 0.15  # longer than the window over which odometry takes its speed
 SEARCH_LEAST = 0.15  # metres of remembered line in view that are worth a closer look
@@ -140,6 +141,8 @@ class LineFollowerDriver(Driver):
         self._history = PoseHistory()
         self._marks = MarkTracker()
         self._eye.forget()
+        self._eye.expect(self.config.line_width)
+        self._started = -math.inf  # when `follow` was last called
         self._line_t = -math.inf  # when it was last seen
         self._doubt: tuple[float, str] | None = None  # since when pictures are useless, and why
         self._state: LineState = "standing"
@@ -201,7 +204,7 @@ class LineFollowerDriver(Driver):
     # ---- steering ----------------------------------------------------------------------------------------------------
 
     async def _drive(self, travelled: float, watching: asyncio.Task[None], *, at_marker: bool) -> FollowEnd:
-        started = before = now()
+        self._started = before = now()
         standing: float | None = None
         with self.bus.odometry.subscribe(size=4) as odometry:
             async for state in odometry:
@@ -212,7 +215,7 @@ class LineFollowerDriver(Driver):
                 if self._doubt is not None and now() - self._doubt[0] >= BLIND_S:
                     self._give_up(f"line lost: {self.config.camera}: {self._doubt[1]}; look at that camera")
                 if len(self.tracker.path) < 2:
-                    self._await_line(started)
+                    self._await_line()
                     continue
                 steering, reached = self._next(state, travelled, dt, at_marker=at_marker)
                 if reached is None or abs(state.speed) > STANDSTILL_M_S:
@@ -255,10 +258,10 @@ class LineFollowerDriver(Driver):
         self._enter(move.state)
         return Steering(0.0, move.turn_rate, steering.offset, steering.heading_error, steering.beyond, steering.left)
 
-    def _await_line(self, started: float) -> None:
+    def _await_line(self) -> None:
         self._enter("acquiring")
         self._command(0.0, 0.0)
-        if now() - started > FIRST_SIGHT_S:
+        if now() - self._started > FIRST_SIGHT_S:
             raise MissionError(
                 f"no line in view of {self.config.camera} for {FIRST_SIGHT_S:g} s;"
                 " put the robot on the line, heading along it"
@@ -336,7 +339,7 @@ class LineFollowerDriver(Driver):
         if tracker.see(self.latest_line):
             return "tracking"
         if len(tracker.path) == 0:
-            return None
+            return await self._find_other_width()
         if tracker.expected >= SEARCH_LEAST:
             if tracker.see(await in_thread(self._eye.search, tracker.around(SEARCH_NEAR)), relaxed=True):
                 return "searching near"
@@ -347,6 +350,19 @@ class LineFollowerDriver(Driver):
                 return "searching all"
         if self._lost.is_turning and tracker.acquire_anew(await in_thread(self._eye.search)):
             return "searching all"
+        return None
+
+    async def _find_other_width(self) -> LineState | None:
+        """A sure line that is not as wide as it was said to be, if for a while no other came into view."""
+        if now() - self._started < OTHER_WIDTH_S:
+            return None
+        for line in await in_thread(self._eye.search):
+            if line.confidence >= SURE_CONFIDENCE and self.tracker.see([line]):
+                width = line.width * self.view.metres_per_pixel
+                self._eye.expect(width)
+                said = f"line_width = {self.config.line_width:g}"
+                self.report(f"the line looks {width:.3f} m wide instead of {said}: followed as it looks")
+                return "tracking"
         return None
 
     def _enter(self, state: LineState) -> None:

@@ -86,6 +86,14 @@ def test_the_front_camera_of_the_rig_does_instead_of_a_floor_camera():
     assert result.cross_track["rms"] < 20.0
 
 
+def test_a_line_that_is_wider_than_was_said_is_followed_as_it_looks():
+    layout, _ = store([(0.0, 0.0), (1.2, 0.0)], texture="concrete", width=0.05)
+    result = drive(layout, [0.5], line_width=0.036)
+    assert result.fault is None
+    assert [reason for reason, _, _ in result.stops] == ["distance"]
+    assert result.cross_track["rms"] < 10.0
+
+
 # ---- the path to drive -----------------------------------------------------------------------------------------------
 
 RIGHT_ANGLE = np.array([(-0.5, 0.0), (0.6, 0.0), (0.6, 0.9)])
@@ -179,6 +187,12 @@ def test_pictures_that_show_nothing_are_named():
     assert look.doubt(np.zeros((2, 3), np.uint8)) == "its pictures are 3x2 pixels instead of 320x240"
     assert "instead of 320x240" in look.doubt(np.zeros((240, 320, 3), np.uint8))
     assert look.doubt(good[0]) is None
+
+
+def test_a_dim_picture_with_the_last_of_a_tape_is_not_blank():
+    dim = np.random.default_rng(1).normal(51, 2, (480, 640))
+    dim[455:, 310:330] -= 25.0
+    assert eye(size=(640, 480)).doubt(dim.clip(0, 255).astype(np.uint8)) is None
 
 
 def drawn(view, marks, lines=()):

@@ -18,6 +18,7 @@ SURE_CONFIDENCE = 0.5  # of a line that may be ours, whatever else is in view
 RELAXED_CONFIDENCE = 0.25  # of a line that is searched where it is predicted, or after a loss
 DEPTH = 0.80  # m of floor, from the nearest in view on, that the top view has at least
 FARTHEST = 3.0  # m before the robot within which a camera must see floor
+BLOCKS = (32, 24)  # of a picture, across and down: small enough for the last of a tape, large enough to average noise
 FLAT = 4.0  # grey levels between the darkest and the brightest block of a picture: nobody looks through that lens
 CLIPPED = 0.9  # share of pixels at white beyond which a picture shows nothing
 WHITE = 250
@@ -64,14 +65,8 @@ class LineEye:
         near = max(x[0], _nearest_floor(camera))
         self.view = TopView(camera, metres_per_pixel, (x[0], max(x[1], near + DEPTH)), y)
         self.blind = float(self.view.to_robot(np.array([[0.0, self.view.valid.shape[0] - 1.0]]))[0, 0])
-        width = line_width / metres_per_pixel
-
-        def detector(tolerance: float, least: float) -> LineDetector:
-            widths = max(width * (1.0 - tolerance), 1.0), max(width * (1.0 + tolerance), 1.0)
-            return LineDetector(LineConfig(color, widths, least))  # type: ignore[arg-type]
-
-        self._detector = detector(WIDTH_TOLERANCE, SURE_CONFIDENCE)
-        self._searcher = detector(RELAXED_TOLERANCE, RELAXED_CONFIDENCE)
+        self._color = color
+        self.expect(line_width)
         self._top: Bytes = np.empty(self.view.valid.shape, np.uint8)
         self._last: Bytes | None = None
 
@@ -79,6 +74,17 @@ class LineEye:
     def top(self) -> Bytes:
         """The top view of the last picture looked at."""
         return self._top
+
+    def expect(self, line_width: float) -> None:
+        """From now on look for a line of this width (metres, as it looks: glare and blur make bright tape wider)."""
+        width = line_width / self.view.metres_per_pixel
+
+        def detector(tolerance: float, least: float) -> LineDetector:
+            widths = max(width * (1.0 - tolerance), 1.0), max(width * (1.0 + tolerance), 1.0)
+            return LineDetector(LineConfig(self._color, widths, least))  # type: ignore[arg-type]
+
+        self._detector = detector(WIDTH_TOLERANCE, SURE_CONFIDENCE)
+        self._searcher = detector(RELAXED_TOLERANCE, RELAXED_CONFIDENCE)
 
     def forget(self) -> None:
         """The next picture is the first of a new stream."""
@@ -92,7 +98,7 @@ class LineEye:
             return f"its pictures are {found} pixels instead of {self._size[0]}x{self._size[1]}"
         if last is not None and np.array_equal(last, image):  # because two pictures of a real camera never are
             return "its picture is frozen"
-        blocks = cv2.resize(image, (8, 6), interpolation=cv2.INTER_AREA)
+        blocks = cv2.resize(image, BLOCKS, interpolation=cv2.INTER_AREA)
         low, high = int(blocks.min()), int(blocks.max())
         if np.count_nonzero(image >= WHITE) > CLIPPED * image.size:
             return "its picture is saturated"
