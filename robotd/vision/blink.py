@@ -55,6 +55,7 @@ _LOOK_S = 1.0  # after which a camera that shakes looks again at what its pictur
 _TESTS_APART = 4  # apertures, and starts per flash, that are about one independent test
 FLOOR_PX = 0.01  # what fits keep in bias however strong the light: sampling, texture, the camera's curve
 _STEADY = 0.002  # relative change of the light below which lamps do not flicker
+_WIDE_PX = 2.0  # the place of a wider light may be less certain in proportion
 _CENSORED = 2.5  # a light that is partly clipped may be so much less certain in place
 _SEPARATION = 3  # cells; nearer lights are one light
 
@@ -72,7 +73,7 @@ class FlashConfig:
     min_alternation: float = ranged(3.0, minimum=1.0, doc="step 2: standard deviations above the neighbourhood")
     false_alarms_per_hour: float = ranged(1.0, minimum=1e-6, maximum=1e6, doc="step 3: of noise alone, at most")
     min_margin: float = ranged(5.0, minimum=0.0, doc="step 3: log-likelihood ratio against steady blinking")
-    max_width_px: float = ranged(2.5, minimum=0.5, doc="a light is no wider (sigma) than this")
+    max_width_px: float = ranged(4.5, minimum=0.5, doc="a light is no wider (sigma) than this")
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
     steady_hz: tuple[float, ...] = (1.0, 2.0, 5.0, 8.0, 10.0)
     max_candidates: int = ranged(72, minimum=1, maximum=2000, doc="apertures examined at one decision")
@@ -289,7 +290,7 @@ class FlashDetector:
         if not self._count:
             self._shake.refer(frame, np.zeros(2))
         self._shifts[now] = self._shake.measure(cells)
-        self._lamps[now] = self.config.gamma * self._shake.brightness
+        self._lamps[now] = np.maximum(1.0 + self._shake.brightness, 0.1) ** self.config.gamma - 1.0
         self._shift_sum += self._shifts[now]
         number, lagged, move = self._lagged(t), None, np.zeros(2)
         if number is not None:
@@ -393,18 +394,22 @@ class FlashDetector:
         image = track.numerator[1:7, 1:7]
         sums = image[:-1, :-1] + image[1:, :-1] + image[:-1, 1:] + image[1:, 1:]
         down, right = divmod(int(np.argmax(sums)), 5)
+        row, column = track.row + down - 2, track.column + right - 2
+        if not self._is_inside(row, column) or self._is_known(row, column):
+            return
         if (down, right) != (2, 2):
-            row, column = track.row + down - 2, track.column + right - 2
-            if not self._is_inside(row, column):
-                return
             self._memory.move(track.row, track.column, row, column)
             track = self._track(k, matches, self._curves(np.array([row]), np.array([column])))
-        if self.spot(track) is None:
-            self._alternation.refuse_around(track.row, track.column, _NO_SPOT)
-            return
-        away = [np.hypot(other.row - track.row, other.column - track.column) for other in self.tracks]
-        if min(away, default=np.inf) > _SEPARATION:
+        spot = self.spot(track)
+        if spot is None:
+            self._alternation.refuse_around(row, column, _NO_SPOT)
+        elif not self._is_known(spot.v / 2.0 - 0.75, spot.u / 2.0 - 0.75, spot.width / 2.0):
             self.tracks.append(track)
+
+    def _is_known(self, row: float, column: float, width: float = 0.0) -> bool:
+        """Whether a track is so near that this is the same light, which is so many cells wide (sigma)."""
+        within = max(_SEPARATION, 2.0 * width)
+        return any(np.hypot(track.row - row, track.column - column) <= within for track in self.tracks)
 
     def _track(self, k: int, matches: Matches, curves: _Curves) -> Track:
         track = Track(
@@ -461,7 +466,7 @@ class FlashDetector:
             if spot is not None:
                 shift = self._shift_sum / max(self._count, 1)
                 least = self.config.max_sigma_px * (_CENSORED if track.clipped.any() else 1.0)
-                small = spot.sigma <= least and spot.width <= self.config.max_width_px
+                small = spot.sigma <= least * max(1.0, spot.width / _WIDE_PX) and spot.width <= self.config.max_width_px
                 spot = spot.moved(shift[0], shift[1]) if small else None
             track.spot = spot
             track.fitted = track.last

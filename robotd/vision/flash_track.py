@@ -20,6 +20,7 @@ from .spot import Spot, fit_spot
 Floats = NDArray[np.float64]
 
 _WHITE = 246  # grey level of four pixels, from which on noise alone makes some white
+_LEAST_VARIANCE = 1e-3  # of linear light in a cell, that of a tenth of a grey level in the dark
 _LOOKS = 14  # kept, of one window each
 
 
@@ -36,7 +37,7 @@ class Track:
     last: float = -np.inf  # time up to which frames are in the sums
     numerator: Floats = field(default_factory=lambda: np.zeros((8, 8)))
     squares: Floats = field(default_factory=lambda: np.zeros((8, 8)))
-    weight: float = 0.0
+    weight: float = 0.0  # energy of the pattern in units of the noise
     dof: int = 0
     clipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((8, 8), bool))
     base: float = 0.0
@@ -62,13 +63,17 @@ class Track:
         values = light[cells].astype(float) / rest.lamps[:, None, None]
         numerator = np.tensordot(rest.wave, values, 1)
         explained = np.tensordot(rest.basis, values, 1)
-        self.numerator += numerator
-        self.squares += (values**2).sum(axis=0) - (explained**2).sum(axis=0) - numerator**2 / rest.weight
-        self.weight += rest.weight
-        self.dof += len(values) - 1 - len(rest.basis)
+        left = (values**2).sum(axis=0) - (explained**2).sum(axis=0) - numerator**2 / rest.weight
+        dof = max(len(values) - 1 - len(rest.basis), 1)
+        # frames between which the light changed, or that somebody crossed, count the less
+        worth = 1.0 / max(float(np.median(left)) / dof, _LEAST_VARIANCE)
+        self.numerator += worth * numerator
+        self.squares += worth * left
+        self.weight += worth * rest.weight
+        self.dof += dof
         self.clipped |= cells[rest.wave > 0.5 * rest.wave.max()].mean(axis=0) >= _WHITE
         self.base = float(np.median(values.mean(axis=0)))
-        self.shift += rest.weight * rest.shift
+        self.shift += worth * rest.weight * rest.shift
         self.last = t
         if rest.look is not None:
             self.looks.append(rest.look)

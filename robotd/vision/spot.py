@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 _ITERATIONS = 15
+_GOOD = 1.3  # mean squared residual, in units of the variance, from which another start is tried
 _WIDTH = np.log(1.1), 0.35  # mean and spread of log(px): without it a spot within 2x2 cells could be anywhere in them
-_WIDTH_LIMITS = (0.45, 4.0)  # px: narrower than a pixel's own response is a hot pixel, wider is no label
+_WIDTH_LIMITS = (0.45, 6.0)  # px: narrower than a pixel's own response is a hot pixel, wider is no label
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +82,12 @@ def fit_spot(
     if np.count_nonzero(valid) < 12:
         return None
     weights = 1.0 / np.maximum(variance, 1e-12)
-    best: tuple[float, Floats, Floats] | None = None
-    for guess in _starts(image, valid, pitch, start):
+    first, *others = _starts(image, valid, pitch, start)
+    best = _descend(first, image, weights, valid, pitch)
+    for guess in others if best[0] > _GOOD * np.count_nonzero(valid) else ():
         found = _descend(guess, image, weights, valid, pitch)
-        if best is None or found[0] < best[0]:
+        if found[0] < best[0]:
             best = found
-    assert best is not None
     cost, parameters, normal = best
     peak, u, v, log_width, _ = parameters
     if peak <= 0.0 or not (0.0 < u < image.shape[1] * pitch - 1.0 and 0.0 < v < image.shape[0] * pitch - 1.0):
