@@ -83,7 +83,7 @@ def test_two_seconds_hold_enough_of_a_pattern_wherever_it_starts(pattern):
     starts = np.arange(0.0, pattern.period, 0.02)
     light = np.array([pattern.coverage((times - start) % pattern.period, 0.01, 2) for start in starts])
     light += 0.05 * np.random.default_rng(0).normal(size=light.shape)
-    found = Matcher(pattern, 0.01, (1.0, 2.0, 5.0, 10.0)).match(
+    found = Matcher(pattern, 0.01, (0.6, 10.0)).match(
         times, light.astype(np.float32), np.full(light.shape, 30.0, np.float32), np.zeros((len(times), 2))
     )
     assert found.regular.all()
@@ -271,7 +271,7 @@ def test_lamps_that_flicker_are_measured_and_taken_off():
     label = 10.0 * pattern.coverage((times - 0.3) % 1.0, 0.01, 2) + 0.5 * rng.normal(size=len(times))
     curve = (label - 150.0 * (1.0 + 0.8 * flicker)).astype(np.float32)  # a dark place in bright surroundings
     levels = (50.0 * (1.0 + 0.8 * flicker) + 0.1 * rng.normal(size=flicker.shape)).astype(np.float32)
-    matcher, still = Matcher(pattern, 0.01, (1.0, 2.0, 5.0, 10.0)), np.zeros((len(times), 2))
+    matcher, still = Matcher(pattern, 0.01, (0.6, 10.0)), np.zeros((len(times), 2))
     steadied = matcher.match(times, curve, levels, still, flicker)
     assert steadied.score[0] > 2.0 * matcher.match(times, curve, levels, still).score[0]
     assert steadied.regular.all()

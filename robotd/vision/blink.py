@@ -75,7 +75,7 @@ class FlashConfig:
     min_margin: float = ranged(5.0, minimum=0.0, doc="step 3: log-likelihood ratio against steady blinking")
     max_width_px: float = ranged(4.5, minimum=0.5, doc="a light is no wider (sigma) than this")
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
-    steady_hz: tuple[float, ...] = (1.0, 2.0, 5.0, 8.0, 10.0)
+    steady_hz: tuple[float, float] = (0.6, 10.0)  # limits of the rates of other things that blink
     max_candidates: int = ranged(72, minimum=1, maximum=2000, doc="apertures examined at one decision")
     max_reflection: float = ranged(0.8, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
 

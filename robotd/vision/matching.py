@@ -33,8 +33,12 @@ _ENOUGH = 0.3  # of a period's energy that must be within the window, to count b
 _LOOK_S, _LOOK_PITCH_S = 0.03, 0.0015  # starts so far from the best match are weighed, at this pitch
 _PROMISING = 12.0  # explained energy of a place, relative to a frame's, from which its start is refined,
 _BESIDE, _FINE_S = 0.75, 0.004  # within so many steps of the search, to so many seconds
+_LIKELY = 10.0  # score from which a place is compared with steady blinking, of so many harmonics
+_HARMONICS = 3
+_ALIKE = 0.7  # of the pattern's energy: steady blinking that explains so much is the pattern
 _CRUDE = 0.04  # of the light, that a half exposed frame is off by
 _MOST_OUTLIERS = 0.12  # of the frames that count: with more, it is not the pattern that is there
+_MOST_LIT = 0.08  # of the frames between flashes
 
 
 @dataclass(slots=True, eq=False)
@@ -78,7 +82,7 @@ class Cleared:
 class Matcher:
     """Compares light curves with one pattern."""
 
-    def __init__(self, pattern: FlashPattern, exposure: float, steady_hz: tuple[float, ...]) -> None:
+    def __init__(self, pattern: FlashPattern, exposure: float, steady_hz: tuple[float, float]) -> None:
         self._pattern = pattern
         self._exposure = exposure
         self._template = Template(pattern, exposure)
@@ -120,12 +124,20 @@ class Matcher:
         partial = 0.35 * found.light[:, None]  # what a frame that is half exposed to a flash may be wrong by
         inliers = seen & (np.abs(residual) <= _OUTLIER * spread[:, None] + partial)
         lost = seen.sum(axis=1) - inliers.sum(axis=1)
+        # because steady blinking less the frames that contradict the pattern looks like the pattern
+        better = found.margin >= 0.0
         doubtful = np.flatnonzero(lost > 0)
         if len(doubtful):
             again, _ = self._search(times, values[doubtful], inliers[doubtful], starts, single, basis)
             for name in Matches.__slots__:
                 getattr(found, name)[doubtful] = getattr(again, name)
-        found.regular &= lost <= _MOST_OUTLIERS * seen.sum(axis=1)
+        found.regular &= better & (lost <= _MOST_OUTLIERS * seen.sum(axis=1))
+        # steady blinking that somebody hid for a while may look like two periods, but for light where none should be
+        since = times - found.start[:, None]
+        flashing = seen & (since >= 0.0) & (since < found.periods[:, None] * self._pattern.period)
+        dark = flashing & (self._template.run(since, found.periods[:, None].astype(float)) < 0.02)
+        lit = dark & (residual > 0.4 * found.light[:, None] + 2.0 * spread[:, None])
+        found.regular &= lit.sum(axis=1) <= 1 + _MOST_LIT * dark.sum(axis=1)
         found.regular &= found.frames >= _LEAST_SEEN * known.sum(axis=1)
         return found
 
@@ -241,11 +253,12 @@ class Matcher:
         wave, gain, light = _regressed(y, weights, frames, wave)
         left = np.maximum(energy - gain, 1e-6)
         residual = (y - light[:, None] * wave) * weights
-        steady = energy.copy()
-        steady[promising] = self._steady_residual(times, y[promising], weights[promising], energy[promising])
         half = 0.5 * (frames.astype(float) - basis.shape[1])
+        score = half * np.log(energy / left)
+        steady, doubtful = energy.copy(), score > _LIKELY
+        steady[doubtful] = self._steady_residual(times, y[doubtful], weights[doubtful], energy[doubtful])
         matches = Matches(
-            score=half * np.log(energy / left),
+            score=score,
             margin=half * np.log(steady / left),
             start=begin,
             periods=periods.astype(np.intp),
@@ -281,13 +294,21 @@ class Matcher:
             begin[chosen[better]] = middle[better] + offset
 
     def _steady_residual(self, times: Floats, y: Singles, weights: Singles, energy: Floats) -> Floats:
-        """What the best steady blinking (a sine with its third harmonic) leaves of each light curve's energy."""
+        """What the best steady blinking (three harmonics, any rate) leaves of each light curve's energy."""
         if not len(y):
             return energy
-        angle = 2.0 * np.pi * np.multiply.outer(self._steady_hz, times - times[0])
-        ones = np.ones_like(angle)
-        waves = np.stack([ones, *(f(k * angle) for k in (1, 3) for f in (np.cos, np.sin))], axis=1)
-        return np.asarray(np.maximum(energy - _explained(y, weights, waves.astype(np.float32)).max(axis=1), 1e-6))
+        seconds = max(float(times[-1] - times[0]), 1e-3)
+        rates = np.arange(*self._steady_hz, 0.5 / seconds)  # half a turn from one to the next, over the whole window
+        turns = np.exp(2j * np.pi * rates[:, None] * (times - times[0]))
+        # those that are as good as the pattern are no rivals
+        whole = int(seconds / self._pattern.period) + 2
+        wave = self._pattern.coverage(times - times[0] + self._pattern.period, self._exposure, whole)
+        wave = (wave - wave.mean())[None].astype(np.float32)
+        alike = _explained(wave, np.ones_like(wave), turns)[0]
+        turns = turns[alike <= _ALIKE * float(wave[0] @ wave[0])]
+        if not len(turns):
+            return energy
+        return np.asarray(np.maximum(energy - _explained(y, weights, turns).max(axis=1), 1e-6))
 
 
 def _regressed(y: Singles, weights: Singles, frames: Singles, wave: Singles) -> tuple[Singles, Singles, Singles]:
@@ -368,17 +389,32 @@ def _without(values: Singles, weights: Singles, basis: Singles) -> Singles:
     return np.asarray(values - factors @ b.T, np.float32)
 
 
-def _explained(y: Singles, weights: Singles, waves: Singles) -> Floats:
-    """Energy (N, H) that each of H sets of waves (H, B, F) explains of light curves (N, F), zero where weights are."""
-    sets, size, frames = waves.shape
-    products = (waves[:, :, None, :] * waves[:, None, :, :]).reshape(-1, frames)
-    normal = np.einsum("nf,kf->nk", weights, products).reshape(len(y), sets, size, size).astype(float)
+def _explained(y: Singles, weights: Singles, turns: NDArray[np.complex128]) -> Floats:
+    """Energy (N, H) that a constant and _HARMONICS harmonics of each of H rates explain of light curves.
+
+    Parameters
+    ----------
+    y, weights : (N, F)
+        Light curves, zero where their weight is; weights are 0 or 1.
+    turns : (H, F) complex
+        exp(i 2 pi rate t).
+
+    Notes
+    -----
+    Least squares in the basis of exp(i k 2 pi rate t), whose normal matrix is Toeplitz.
+    """
+    powers = np.arange(2 * _HARMONICS + 1)
+    waves = turns[:, None, :] ** powers[:, None]
+    sums = np.einsum("nf,hkf->nhk", weights, waves)
+    sums = np.concatenate([sums[:, :, :0:-1].conj(), sums], axis=2)  # of the powers -2 _HARMONICS to 2 _HARMONICS
+    right = np.einsum("nf,hkf->nhk", y, waves[:, : _HARMONICS + 1].conj())
+    right = np.concatenate([right[:, :, :0:-1].conj(), right], axis=2)
+    orders = np.arange(-_HARMONICS, _HARMONICS + 1)
+    normal = sums[:, :, (orders - orders[:, None]) + 2 * _HARMONICS]
     # because sampled waves may be aliases of one another
-    normal += 1e-3 * np.maximum(weights.sum(axis=1), 1.0)[:, None, None, None] * np.eye(size)
-    right = np.einsum("nf,kf->nk", y, waves.reshape(-1, frames)).reshape(len(y), sets, size).astype(float)
+    normal += 1e-3 * np.maximum(weights.sum(axis=1), 1.0)[:, None, None, None] * np.eye(len(orders))
     factors = np.linalg.solve(normal, right[..., None])[..., 0]
-    explained = 2.0 * np.einsum("nhb,nhb->nh", factors, right)
-    return np.asarray(explained - np.einsum("nha,nhab,nhb->nh", factors, normal, factors))
+    return np.asarray(np.einsum("nhk,nhk->nh", factors, right.conj()).real)
 
 
 def _spread(residual: Singles, seen: NDArray[np.bool_]) -> Floats:
