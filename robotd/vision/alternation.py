@@ -31,6 +31,7 @@ _LOW, _HIGH = 4.0, 375  # a block's alternation counts no further than so many t
 _CLEAR = 1.8  # limits from which a place is clear enough to be examined at every decision
 _FAINT = 0.6  # limits from which a place is watched
 _STAYS = 1.15  # by which a place that is watched is preferred to its neighbours
+_SLOPE = 0.1  # of the mean around a place, that is added to find its middle
 _FORGET = 0.8  # of a place's refusals, from one decision to the next
 _TILE = (24, 32)  # cells over which the false alarm rate is held constant
 _SEPARATION = 3  # cells around a known light that are no places of their own
@@ -191,7 +192,9 @@ class Alternation:
     @staticmethod
     def _peaks(image: Singles, most: int, least: float = 0.0) -> Indices:
         """Flat indices of the highest local maxima, highest first."""
-        peaks = np.flatnonzero((image > least) & (image >= cv2.dilate(image, np.ones((3, 3), np.uint8))))
+        # because a strong light's alternation is limited, and as high all over it
+        sloped = cv2.addWeighted(image, 1.0, cv2.blur(image, (5, 5)), _SLOPE, 0.0)
+        peaks = np.flatnonzero((image > least) & (sloped >= cv2.dilate(sloped, np.ones((3, 3), np.uint8))))
         return peaks[np.argsort(-image.ravel()[peaks], kind="stable")][:most]
 
     def _divide(self, total: Singles) -> None:
