@@ -36,6 +36,7 @@ _SURE = 0.95  # confidence below which the answer is a refusal
 _RIVAL = 0.3  # a second place that flashes differently counts if it is so strong, relative to the first
 _ROUNDS = 6  # of refinement, at most
 _ALLOWED = 4.0  # loss above the best one's, in squared spreads, that an edge or the period may have
+_ALLOWED_FREE = 9.0  # the same of the period where every edge is free, because several periods may do almost as well
 _STAMPS_S = 0.002  # time stamps are off by so much
 _HUGE = 1e12
 
@@ -261,6 +262,8 @@ class _Fit:
             if loss > 0.98 * best:
                 break
             best = loss
+        if not period:
+            self.period_sigma = self._period_spread()
 
     # ---- period ------------------------------------------------------------------------------------------------------
 
@@ -323,21 +326,25 @@ class _Fit:
             flashes.append([float(start), float(start + (end - start) % self.period)])
         return flashes
 
-    def _share(self, on: list[list[float]], period: float) -> Floats:
-        """Share of each exposure in which the light is on; phases are kept at the recording's middle."""
+    def _shares(self, on: list[list[float]], period: float) -> tuple[Floats, Floats]:
+        """Share of each exposure in which the light is on, and its standard deviation.
+
+        Time stamps are a little off, which matters at the edges. Phases are kept at the recording's middle.
+        """
         middle = 0.5 * (self.times[0] + self.times[-1])
-        since = self.times - middle + (middle % self.period)
-        total = np.zeros(len(self.times))
+        since = self.times - middle + (middle % period) + _STAMPS_S * np.array([[-1.0], [1.0]])
+        total = np.zeros((2, len(self.times)))
         for start, end in on:
             lag = (since - start + self.exposure) % period - self.exposure
             for turn in (0.0, period):
                 total += np.clip(np.minimum(lag + self.exposure, turn + end - start) - np.maximum(lag, turn), 0.0, None)
-        return np.minimum(total / self.exposure, 1.0)
+        early, late = np.minimum(total / self.exposure, 1.0)
+        return 0.5 * (early + late), 0.5 * np.abs(late - early)
 
     def _loss(self, on: list[list[float]], period: float) -> float:
-        """Sum of squared residuals in units of the noise, each limited, with the best dark and light."""
-        share = self._share(on, period)
-        weights = np.ones(len(share))
+        """-2 log likelihood: squared residuals in units of their spread, each limited, with the best dark and light."""
+        share, unsure = self._shares(on, period)
+        weights, spread = np.ones(len(share)), np.full(len(share), self.noise)
         residual = self.curve
         for _ in range(2):
             w = weights.sum()
@@ -345,8 +352,11 @@ class _Fit:
             self.light = float(weights @ ((share - mx) * (self.curve - my)) / max(weights @ (share - mx) ** 2, 1e-12))
             self.dark = float(my - self.light * mx)
             residual = self.curve - self.dark - self.light * share
-            weights = 1.0 / (1.0 + (residual / (_CLIP * self.noise)) ** 2)
-        return float(np.minimum((residual / self.noise) ** 2, _CLIP**2).sum()) if self.light > 0.0 else _HUGE
+            spread = np.hypot(self.noise, self.light * unsure)
+            weights = 1.0 / (1.0 + (residual / (_CLIP * spread)) ** 2)
+        if self.light <= 0.0:
+            return _HUGE
+        return float(np.minimum((residual / spread) ** 2, _CLIP**2).sum() + 2.0 * np.log(spread / self.noise).sum())
 
     def _divide(self) -> None:
         """Take a fraction of the period if the flashes repeat within it."""
@@ -383,7 +393,7 @@ class _Fit:
         shift = middle % period - middle % self.period  # so that the middle keeps its phase
         _, on = self._settled(period)
         self.on = [[start + shift, end + shift] for start, end in on]
-        self.period, self.period_sigma = period, float(np.hypot(allowed.std(), (trials[1] - trials[0]) / 3.5))
+        self.period = period
         worst = 0.0
         reach = 0.6 * self.pace + self.exposure
         spans = np.linspace(-1.0, 1.0, 33)
@@ -400,6 +410,28 @@ class _Fit:
                 flash[side] = float(allowed.mean())
                 worst = max(worst, float(np.hypot(allowed.std(), (trials[1] - trials[0]) / 3.5)))
         self.edge_sigma = float(np.hypot(worst, _STAMPS_S))
+
+    def _period_spread(self) -> float:
+        """How far off the period may be: the spread about it of others that do almost as well if every edge is free."""
+        trials = self.period + self.pace / self.seconds * self.period * np.linspace(-1.0, 1.0, 17)
+        losses = np.array([self._freed(float(trial)) for trial in trials])
+        away = trials[losses <= losses.min() + _ALLOWED_FREE] - self.period
+        return float(np.sqrt(np.mean(away**2) + ((trials[1] - trials[0]) / 3.5) ** 2))
+
+    def _freed(self, period: float) -> float:
+        """Least loss of a period if every edge moves by itself."""
+        best, on = self._settled(period)
+        on = [list(flash) for flash in on]
+        for flash in on:
+            for side in (0, 1):
+                chosen = flash[side]
+                for trial in chosen + 0.4 * self.pace * np.linspace(-1.0, 1.0, 7):
+                    flash[side] = float(trial)
+                    loss = self._loss(on, period) if flash[1] - flash[0] > 0.004 else _HUGE
+                    if loss < best:
+                        best, chosen = loss, flash[side]
+                flash[side] = chosen
+        return best
 
     def _settled(self, period: float) -> tuple[float, list[list[float]]]:
         """Least loss of a period, and its flashes, moved all by as much and widened all by as much."""
@@ -419,7 +451,7 @@ class _Fit:
 
     def _residual(self) -> Floats:
         self._loss(self.on, self.period)
-        return self.curve - self.dark - self.light * self._share(self.on, self.period)
+        return self.curve - self.dark - self.light * self._shares(self.on, self.period)[0]
 
     # ---- doubts ------------------------------------------------------------------------------------------------------
 
