@@ -33,6 +33,7 @@ KERNELS = {
     "bundle": "robotd.solver._bundle",
     "rays": "robotd.solver._rays",
     "json_keys": "robotd._json_keys",
+    "sightings": "robotd._sightings",
 }
 
 

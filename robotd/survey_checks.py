@@ -5,12 +5,12 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
-from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import sighting_columns
 from .bind import describe
 from .errors import InputError
 from .records import CameraModel, MappedLabel, Matrix3, Rig, RoofCamera, Stop, Survey
@@ -173,13 +173,9 @@ def _suspects(stops: tuple[Stop | None, ...], rig: Rig | None) -> NDArray[np.boo
     if rig is None or any(stop is None or None in stop.sightings for stop in stops):
         return suspect
     everything = [s for stop in stops if stop is not None for s in stop.sightings]
-    count = len(everything)
     numbers = {camera.name: k for k, camera in enumerate(rig.cameras)}
-    camera = np.fromiter((numbers.get(s.camera, -1) for s in everything), np.int64, count)
-    u, v = (np.fromiter(map(attrgetter(name), everything), np.float64, count) for name in ("u", "v"))
-    sigma = np.fromiter((1.0 if s.sigma_px is None else s.sigma_px for s in everything), np.float64, count)
-    probability = np.fromiter((1.0 if s.probability is None else s.probability for s in everything), np.float64, count)
-    named = np.fromiter((s.label != "" for s in everything), np.bool_, count)
+    camera, labels, (u, v, sigma, probability) = sighting_columns.read(everything, numbers, 1.0)
+    named = np.fromiter(map(bool, labels), np.bool_, len(labels))
     good = (camera >= 0) & named & (sigma > 0.0) & (probability >= 0.0) & (probability <= 1.0)
     limits = np.array([_limits(model) for model in rig.cameras]).reshape(-1, 4)
     if len(limits):

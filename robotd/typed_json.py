@@ -29,13 +29,19 @@ T = TypeVar("T")
 
 @contextmanager
 def many_records() -> Iterator[None]:
-    """Hold up the garbage collector while very many records are made, because it walks all of them again and again."""
+    """Hold up the garbage collector while very many records are made, because it walks all of them again and again.
+
+    Afterwards they count as old, so that the next collection of young objects does not walk them, either.
+    """
     was_on = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         if was_on:
+            if gc.get_freeze_count() == 0:  # else somebody wants what was frozen to stay so
+                gc.freeze()
+                gc.unfreeze()
             gc.enable()
 
 

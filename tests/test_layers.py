@@ -32,6 +32,7 @@ LAYERS = {
         "safety",
         "vision",
         "solver",
+        *("sighting_columns", "_sightings"),
         "survey_checks",
         "plan_records",
     ],

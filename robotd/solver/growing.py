@@ -193,8 +193,10 @@ class GrowingMap:
             again = doubtful[~np.isin(doubtful, problem.known.label)]
             state, found = retriangulate(near, state, ray_tolerance(near), everywhere, again)
             self._found[again] |= found[again]
-        seen = problem.sightings.select(self._found[problem.sightings.label])
         state = Adjustment(near, near.sightings.select(self._found[near.sightings.label])).solve(state, _WHOLE, 5).state
+        # sightings of labels that are nowhere yet weigh nothing: to leave them out would copy all others
+        weight: Floats = self._found[problem.sightings.label].astype(np.float64)
+        seen = replace(problem.sightings, probability=problem.sightings.probability * weight)
         self._state = Adjustment(problem, seen).solve(state, _WHOLE, 3, _SETTLED, 1e-6).state
         mine = near.sightings.stop == problem.stop_count - 1
         if mine.any() and _explained(near, self._state)[mine].mean() < _EXPLAINED:
@@ -236,8 +238,15 @@ def _explained(problem: Problem, state: State) -> Bools:
 
 def _merged(old: Sightings, new: Sightings) -> Sightings:
     """Both, ordered by camera as sightings are."""
-    at: Ints = np.searchsorted(old.camera, new.camera, side="right")
-    return Sightings(*(np.insert(getattr(old, f.name), at, getattr(new, f.name), axis=0) for f in fields(old)))
+    cameras = np.arange(1 + max(int(old.camera.max(initial=0)), int(new.camera.max(initial=0))))
+    before: list[int] = np.searchsorted(old.camera, cameras).tolist()[1:]
+    begins: list[int] = np.searchsorted(new.camera, cameras).tolist()[1:]
+
+    def merged(name: str) -> Floats:
+        pairs = zip(np.split(getattr(old, name), before), np.split(getattr(new, name), begins), strict=True)
+        return np.concatenate([part for pair in pairs for part in pair])
+
+    return Sightings(*(merged(f.name) for f in fields(old)))  # type: ignore[arg-type]
 
 
 def _joined(old: Arrays, new: Arrays) -> Arrays:

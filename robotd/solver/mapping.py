@@ -25,6 +25,7 @@ from ..records import (
     Survey,
     Vector3,
 )
+from ..sighting_columns import made
 from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
 from .initial import world_rays
@@ -389,16 +390,16 @@ def _sightings(
     weights = np.zeros(len(columns.stop))
     weights[s.source] = weight
     cameras = [camera.name for camera in problem.cameras]
-    return tuple(
-        map(
-            MappedSighting,
+    return made(
+        MappedSighting,
+        [
             np.array([stop.leg for stop in stops])[columns.stop].tolist(),
             np.array([stop.stop for stop in stops])[columns.stop].tolist(),
-            map(cameras.__getitem__, columns.camera.tolist()),
+            [cameras[camera] for camera in columns.camera.tolist()],
             columns.names,
             residuals,
             weights.tolist(),
-        )
+        ],
     )
 
 

@@ -15,15 +15,16 @@ fixed: they have no column in the normal equations, so that a planar problem cos
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from operator import attrgetter
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import sighting_columns
 from ..errors import InputError, SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
-from ..records import Floats, Matrix3, Survey
+from ..records import CameraModel, Floats, Matrix3, Survey
 from ..survey_checks import Problems, check_roof, check_units
 
 Ints = NDArray[np.int64]
@@ -150,16 +151,14 @@ class Columns:
         rows = [s for stop in survey.stops for s in stop.sightings]
         cameras = {camera.name: i for i, camera in enumerate(survey.rig.cameras)}
         default = survey.sigmas.pixel_px if survey.sigmas.pixel_px > 0.0 else 1.0
-        count, uv = len(rows), np.empty((len(rows), 2))
-        for k, name in enumerate(("u", "v")):
-            uv[:, k] = np.fromiter(map(attrgetter(name), rows), np.float64, count)
+        camera, names, (u, v, sigma, probability) = sighting_columns.read(rows, cameras, default)
         return cls(
             stop=np.repeat(np.arange(len(survey.stops)), [len(stop.sightings) for stop in survey.stops]),
-            camera=np.fromiter((cameras.get(s.camera, -1) for s in rows), np.int64, count),
-            names=[s.label for s in rows],
-            uv=uv,
-            sigma=np.fromiter((default if s.sigma_px is None else s.sigma_px for s in rows), np.float64, count),
-            probability=np.fromiter((1.0 if s.probability is None else s.probability for s in rows), np.float64, count),
+            camera=camera,
+            names=names,
+            uv=np.column_stack([u, v]),
+            sigma=sigma,
+            probability=probability,
         )
 
     def suspects(self, stops: int) -> Bools:
@@ -239,7 +238,7 @@ def build_problem(survey: Survey) -> Problem:
         raise SolverError(f"survey {survey.survey}: it has no stops, so there is nothing to map")
     survey = replace(survey, stops=tuple(sorted(survey.stops, key=lambda stop: (stop.leg, stop.stop))))
     columns = _check(survey)
-    cameras = tuple(Camera(model) for model in survey.rig.cameras)
+    cameras = tuple(map(_camera, survey.rig.cameras))
     labels = sorted({*columns.names, *(known.label for known in survey.known_labels)})
     sightings, notes = _sightings(columns, cameras, labels)
     moves, gaps = _moves(survey)
@@ -274,6 +273,12 @@ def build_problem(survey: Survey) -> Problem:
     )
 
 
+@lru_cache(maxsize=32)
+def _camera(model: CameraModel) -> Camera:
+    """A camera; kept, because a survey that grows stop by stop asks for the same ones each time."""
+    return Camera(model)
+
+
 def _check(survey: Survey) -> Columns:
     """Raise InputError if the survey contradicts itself; returns its sightings as columns."""
     doubts = Problems(f"survey {survey.survey}")
@@ -286,7 +291,7 @@ def _check(survey: Survey) -> Columns:
         problems.append(f"{where}: two cameras of the rig have the same name; names are {', '.join(names)}")
     for camera in survey.rig.cameras:
         try:
-            Camera(camera)
+            _camera(camera)
         except ValueError as error:
             problems.append(f"{where}: {error}")
     for roof in survey.roof_cameras:

@@ -120,19 +120,20 @@ def _best_start(
                 )
                 few = _thinned(problem)
                 placement = place(few, moves, schedule.tolerance)
-        solution, spent = _descend(problem, placement, () if schedule is None else schedule.losses)
+        solution, spent, share = _descend(problem, placement, () if schedule is None else schedule.losses)
         iterations += spent
         cost = solution.cost + 1e6 * np.count_nonzero(~placement.placed)
         agreed = best is not None and abs(cost - best[0]) < max(_SAME, 1e-4 * len(problem.sightings))
         if best is None or cost < best[0]:
             best = (cost, placement, solution)
-        if agreed or (placement.placed.all() and _explained(problem, placement, solution.state) > _CLEAN):
+        if agreed or (placement.placed.all() and share > _CLEAN):
             break
     assert best is not None
     return problem, best[1], best[2], iterations
 
 
-def _descend(problem: Problem, placement: Placement, losses: tuple[Loss, ...]) -> tuple[Solution, int]:
+def _descend(problem: Problem, placement: Placement, losses: tuple[Loss, ...]) -> tuple[Solution, int, float]:
+    """The optimum of the strictest loss, iterations, and the share of sightings that it explains."""
     attached = detach(problem, placement.placed)
     adjustment = Adjustment(attached, attached.sightings)
     state, iterations, count = placement.state, 0, len(attached.sightings)
@@ -154,7 +155,7 @@ def _descend(problem: Problem, placement: Placement, losses: tuple[Loss, ...]) -
         tolerance = max(1e-2, 1e-5 * count) if last else max(0.3, 1e-4 * count)
         solution = adjustment.solve(state, loss, iterations=25 if last else 12, tolerance=tolerance, damping=1e-6)
         state, iterations = solution.state, iterations + solution.iterations
-    return solution, iterations
+    return solution, iterations, float((_weights(adjustment, state) > _EXPLAINED).mean()) if count else 1.0
 
 
 def _thinned(problem: Problem) -> Problem:
@@ -173,12 +174,6 @@ def ray_tolerance(problem: Problem) -> float:
     return max(0.015, 4.0 * float(np.median(problem.sightings.sigma)) / focal)
 
 
-def _explained(problem: Problem, placement: Placement, state: State) -> float:
-    attached = detach(problem, placement.placed)
-    weight = _weights(Adjustment(attached, attached.sightings), state)
-    return float((weight > _EXPLAINED).mean()) if len(weight) else 1.0
-
-
 def _weights(adjustment: Adjustment, state: State) -> Floats:
     """(N,) how far the state explains each sighting, 0 to 1."""
     return _REFERENCE((adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1))[1]
@@ -186,15 +181,18 @@ def _weights(adjustment: Adjustment, state: State) -> Floats:
 
 def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> Optimum:
     stated = problem.sightings.sigma
-    problem = _rescaled(problem, _scatter(problem, state))
     everything = Adjustment(problem, problem.sightings)
+    factor = _scatter(everything, state)
+    if factor != 1.0:
+        problem = _rescaled(problem, factor)
+        everything = Adjustment(problem, problem.sightings)
     tolerance = max(1e-2, 1e-5 * len(problem.sightings))
     solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=tolerance, damping=1e-6)
     iterations, state = iterations + solution.iterations, solution.state
     state, rival = doubted(problem, state, problem.sightings.select(_support(everything, state)[1]))
-    state, reflected, hypotheses = _out_of_glass(problem, state)
+    state, reflected, hypotheses = _out_of_glass(everything, state)
     if reflected.any():
-        hypotheses = _hypotheses(problem, state)
+        hypotheses = _hypotheses(everything, state)
     gain, rival_points, rival_gain = hypotheses
     better = rival_gain > gain
     better &= ~(_level(problem, state, rival_points) & _farther(problem, state, rival_points))
@@ -202,19 +200,21 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         state = replace(state, points=np.where(better[:, None], rival_points, state.points))
         problem = _without_known(problem, state, np.flatnonzero(better[problem.known.label]))
     for attempt in range(2):
-        problem, state, inlier, adjustment, spent, converged = _least_squares(problem, state)
+        everything, state, inlier, adjustment, spent, converged = _least_squares(everything, state)
+        problem = everything.problem
         iterations += spent
         sure = covariance(adjustment, state)
         factor = _excess(adjustment, state, sure) if attempt == 0 else 1.0
         if factor == 1.0:
             break
         problem = _rescaled(problem, factor)
+        everything = Adjustment(problem, problem.sightings)
     adjustment, state, sure = weighed(adjustment, state, sure, problem.columns.sigma[problem.sightings.source[inlier]])
     kept = state
-    state, reflected, (gain, rival_points, rival_gain) = _out_of_glass(problem, state)
+    state, reflected, (gain, rival_points, rival_gain) = _out_of_glass(everything, state)
     if state is not kept:  # a label that only now seems to be its image stays where it was adjusted
         state = kept
-        gain, rival_points, rival_gain = _hypotheses(problem, state, reflected)
+        gain, rival_points, rival_gain = _hypotheses(everything, state, reflected)
     factor = float(np.median(problem.sightings.sigma / stated)) if len(stated) else 1.0
     if factor > 1.0:
         note = f"sightings scatter {factor:.1f} times as much as their sigma_px says; uncertainties were scaled"
@@ -226,7 +226,7 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         inlier,
         adjustment,
         sure,
-        (_in_floor(problem, state) | reflected) & ~inlier,
+        (_in_floor(everything, state) | reflected) & ~inlier,
         gain,
         rival_points,
         rival_gain,
@@ -236,23 +236,30 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
     )
 
 
-def _least_squares(problem: Problem, state: State) -> tuple[Problem, State, Bools, Adjustment, int, bool]:
-    """Alternate between choosing the explained measurements and fitting them, until the choice stays."""
+def _least_squares(everything: Adjustment, state: State) -> tuple[Adjustment, State, Bools, Adjustment, int, bool]:
+    """Alternate between choosing the explained measurements and fitting them, until the choice stays.
+
+    Returns the adjustment of everything without what is wrong, the optimum of what is explained, which sightings these
+    are, their adjustment, iterations, and whether it converged.
+    """
     inlier: Bools | None = None
     iterations = 0
     for _ in range(8):
-        cleaned = _without_wrong(problem, state)
-        chosen = explained(Adjustment(cleaned, cleaned.sightings), state)
-        if inlier is not None and cleaned is problem and (chosen == inlier).all():
+        problem = _without_wrong(everything, state)
+        same = problem is everything.problem
+        if not same:
+            everything = Adjustment(problem, problem.sightings)
+        chosen = explained(everything, state)
+        if inlier is not None and same and (chosen == inlier).all():
             break
-        problem, inlier = cleaned, chosen
+        inlier = chosen
         # explained sightings count in full, however doubtful their identity looked to the robot
         certain = replace(problem.sightings.select(inlier), probability=np.ones(np.count_nonzero(inlier)))
         adjustment = Adjustment(problem, certain)
         solution = adjustment.solve(state, SQUARE, iterations=30, tolerance=1e-4, damping=1e-8)
         state, iterations = solution.state, iterations + solution.iterations
     assert inlier is not None
-    return problem, state, inlier, adjustment, iterations, solution.converged
+    return everything, state, inlier, adjustment, iterations, solution.converged
 
 
 def explained(everything: Adjustment, state: State) -> Bools:
@@ -269,12 +276,12 @@ def explained(everything: Adjustment, state: State) -> Bools:
     return np.asarray(good & (stops[sightings.label] >= 2))
 
 
-def _without_wrong(problem: Problem, state: State) -> Problem:
+def _without_wrong(everything: Adjustment, state: State) -> Problem:
     """Loosen moves that disagree with everything else (wheels slip) and drop known labels that do.
 
     Returns the problem itself if nothing was wrong.
     """
-    everything = Adjustment(problem, problem.sightings)
+    problem = everything.problem
     linear = everything.residuals(state, SQUARE)
     moves, known, notes = problem.moves, problem.known, list(problem.notes)
     excess = (linear.move**2).sum(axis=1)
@@ -323,13 +330,14 @@ def _without_known(problem: Problem, state: State, wrong: Ints) -> Problem:
     return problem
 
 
-def _scatter(problem: Problem, state: State) -> float:
+def _scatter(everything: Adjustment, state: State) -> float:
     """By how much explained sightings scatter more than their sigma says, from the median; at least 1."""
-    adjustment = Adjustment(problem, problem.sightings)
-    slack = (adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1)
+    slack = (everything.residuals(state, _REFERENCE).residual ** 2).sum(axis=1)
     near = slack < _REFERENCE.width**2
-    square = (adjustment.residuals(state, SQUARE).residual[near] ** 2).sum(axis=1)
-    unknowns = 3 * len(np.unique(problem.sightings.label[near]))
+    square = (everything.residuals(state, SQUARE).residual[near] ** 2).sum(axis=1)
+    seen = np.zeros(len(everything.problem.labels), dtype=np.bool_)
+    seen[everything.sightings.label[near]] = True
+    unknowns = 3 * int(np.count_nonzero(seen))
     spare = 2 * len(square) - unknowns
     if spare < 20:
         return 1.0
@@ -351,7 +359,7 @@ def _rescaled(problem: Problem, factor: float) -> Problem:
     return replace(problem, sightings=replace(problem.sightings, sigma=problem.sightings.sigma * factor))
 
 
-def _out_of_glass(problem: Problem, state: State) -> tuple[State, Bools, tuple[Floats, Floats, Floats]]:
+def _out_of_glass(everything: Adjustment, state: State) -> tuple[State, Bools, tuple[Floats, Floats, Floats]]:
     """Take labels out of the mirrors in which they were found.
 
     A label's image in a pane is as consistent as the label, and may be seen from more stops. But the robot and the
@@ -365,10 +373,10 @@ def _out_of_glass(problem: Problem, state: State) -> tuple[State, Bools, tuple[F
         With the labels at the nearer positions, the sightings (N,) that the farther ones explain, and what else these
         leave to be said (see `_hypotheses`). The state is the one given if no label was taken out.
     """
+    problem = everything.problem
     reflected = np.zeros(len(problem.sightings), dtype=np.bool_)
-    everything = Adjustment(problem, problem.sightings)
     for _ in range(_IMAGES):
-        gain, rivals, rival_gain = hypotheses = _hypotheses(problem, state, reflected)
+        gain, rivals, rival_gain = hypotheses = _hypotheses(everything, state, reflected)
         swap = _level(problem, state, rivals) & _nearer(problem, state, rivals) & (rival_gain > _CHANCE * gain)
         keep = _level(problem, state, rivals) & _farther(problem, state, rivals)
         if not (swap | keep).any():
@@ -379,7 +387,7 @@ def _out_of_glass(problem: Problem, state: State) -> tuple[State, Bools, tuple[F
             state = replace(state, points=np.where(swap[:, None], rivals, state.points))
         _, direct = _support(everything, state)
         reflected |= (swap | keep)[problem.sightings.label] & shown & ~direct
-    return state, reflected, _hypotheses(problem, state, reflected)
+    return state, reflected, _hypotheses(everything, state, reflected)
 
 
 def _level(problem: Problem, state: State, rivals: Floats) -> Bools:
@@ -409,15 +417,15 @@ def _compared(problem: Problem, state: State, far: Floats, near: Floats) -> Bool
     return result
 
 
-def _hypotheses(problem: Problem, state: State, without: Bools | None = None) -> tuple[Floats, Floats, Floats]:
+def _hypotheses(everything: Adjustment, state: State, without: Bools | None = None) -> tuple[Floats, Floats, Floats]:
     """Support of each label's position, the best position that its other sightings propose, and that one's support.
 
     Sightings `without` (N,) propose nothing. The support is the sum over groups of rivals of probability times
     (1 - squared residual / threshold).
     """
+    problem = everything.problem
     nothing = Known(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     fixed = replace(problem, prior_sigma=np.zeros_like(problem.prior_sigma), known=nothing)
-    everything = Adjustment(fixed, problem.sightings)
     gain, explained_ = _support(everything, state)
     rest = problem.sightings.select(~explained_ if without is None else ~(explained_ | without))
     count = len(problem.labels)
@@ -441,11 +449,11 @@ def _hypotheses(problem: Problem, state: State, without: Bools | None = None) ->
     return gain, np.where(found[:, None], trial.points, np.nan), np.where(found, rival_gain, 0.0)
 
 
-def _in_floor(problem: Problem, state: State) -> Bools:
+def _in_floor(everything: Adjustment, state: State) -> Bools:
     """Which sightings lie where the floor would mirror their label; its tilt and waves move images by some pixels."""
     mirrored = replace(state, points=state.points * [1.0, 1.0, -1.0])
-    linear = Adjustment(problem, problem.sightings).residuals(mirrored, SQUARE)
-    miss = np.linalg.norm(linear.residual, axis=1) * problem.sightings.sigma
+    linear = everything.residuals(mirrored, SQUARE)
+    miss = np.linalg.norm(linear.residual, axis=1) * everything.sightings.sigma
     return np.asarray(linear.valid & (miss < _FLOOR_IMAGE_PX))
 
 

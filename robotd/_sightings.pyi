@@ -1,0 +1,6 @@
+from typing import Any
+
+from numpy.typing import NDArray
+
+def read(rows: list[Any], cameras: dict[str, int], sigma_px: float) -> tuple[NDArray[Any], list[str], NDArray[Any]]: ...
+def made(cls: type, names: tuple[str, ...], columns: list[list[Any]]) -> tuple[Any, ...]: ...
