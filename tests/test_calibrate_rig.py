@@ -62,7 +62,13 @@ def test_known_labels_show_height_and_odometry_and_the_stated_uncertainties_hold
         turn = rotation_vector(rotation_matrix(pose.rotation) @ rotation_matrix(wanted.rotation).T)
         assert np.abs(turn).max() < 4.0 * found.robot_sigma[0] < np.radians(0.5)
         assert np.abs(np.subtract(pose.translation, wanted.translation)).max() < 4.0 * found.robot_sigma[1] < 0.005
-    assert next(mode for mode in result.modes if mode.name == "height").is_shown
+    modes = {mode.name: mode for mode in result.modes}
+    assert modes["height"].is_shown
+    # the Cramer-Rao bound: 20 stops on a floor that slopes by 0.3 degrees
+    assert result.floor_sigma == pytest.approx(np.radians(0.3) / np.sqrt(20.0), rel=1e-3)
+    for name in ("roll", "pitch"):
+        assert modes[name].survey == pytest.approx(result.floor_sigma, rel=0.05)
+    assert "20 stops show them to +- 0.067 degrees at best, 36 to 0.05" in report(result)
     assert result.scale.value == pytest.approx(factors[0], abs=4.0 * result.scale.sigma)
     assert result.turn.value == pytest.approx(factors[1], abs=4.0 * result.turn.sigma)
     for name, place in ROOF_BEACONS.items():

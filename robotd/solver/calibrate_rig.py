@@ -114,6 +114,8 @@ class RigCalibration:
     explained : float
         Share of the sightings that fit.
     notes : tuple of str
+    slope : float
+        Standard deviation of the floor's slope at a stop, as the survey's priors have it, in radians.
     """
 
     cameras: tuple[CameraFit, ...]
@@ -128,6 +130,16 @@ class RigCalibration:
     known: int
     explained: float
     notes: tuple[str, ...]
+    slope: float
+
+    @property
+    def floor_sigma(self) -> float:
+        """Radians to which roll and pitch of the whole rig can show at best, whatever else is known.
+
+        Each stop shows them together with the floor's slope there, so the Cramer-Rao bound is the slope's standard
+        deviation over the root of the number of stops.
+        """
+        return self.slope / float(np.sqrt(self.stops))
 
 
 def merge(surveys: Sequence[Survey]) -> Survey:
@@ -431,6 +443,7 @@ def _result(
         int(np.count_nonzero(np.isin(problem.known.label, s.label))),
         0.0,
         (),
+        asked.survey.priors.tilt_rad,
     )
 
 

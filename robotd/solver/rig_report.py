@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .calibrate_rig import RigCalibration
 from .rig_fit import amount
+
+_WANTED = np.radians(0.05)
 
 
 def report(result: RigCalibration) -> str:
@@ -36,6 +40,13 @@ def report(result: RigCalibration) -> str:
                 f"whole rig, {mode.name}: not observable from this survey (it shows {shown}); kept as measured by "
                 f"tape, +- {amount(mode.name, mode.sigma)}"
             )
+    if result.slope > 0.0:
+        stops = math.ceil((result.slope / _WANTED) ** 2)
+        lines.append(
+            f"roll and pitch rest on the floor, whose slope differs by {np.degrees(result.slope):.2f} degrees from stop "
+            f"to stop: {result.stops} stops show them to +- {np.degrees(result.floor_sigma):.3f} degrees at best, "
+            f"{stops} to {np.degrees(_WANTED):.2f}"
+        )
     for name, (x, y, _) in result.beacons.items():
         lines.append(f"beacon {name}: x {x:.4f}, y {y:.4f} m, +- {1e3 * result.beacon_sigmas[name]:.1f} mm")
     if result.beacon_distance is not None:
