@@ -9,6 +9,7 @@ import pytest
 
 from robotd.errors import InputError, SolverError
 from robotd.files import load_plan, save_plan, save_survey
+from robotd.geometry.transforms import se2_compose, se2_inverse, se2_relative
 from robotd.plan_records import Plan, PlannedFlash, PlannedLabel, PlannedStop
 from robotd.records import Pose
 from robotd.solver.belief import Belief
@@ -20,6 +21,7 @@ from robotd.solver.robust import optimise
 from robotd.solver.viewing_angles import force_field, viewing_angles
 from robotd.solver.ways import along_line, over_floor
 from robotd.solver_main import main
+from tests.bench.stores import make_store, survey_of
 from tests.campaign.plan import compare, drive
 from tests.operated import operated
 
@@ -112,6 +114,25 @@ def test_a_whole_survey_needs_nothing_more(course):
     study = plan(whole, course.line)
     assert study.plan.stops == ()
     assert "no other stop" in study.plan.notes[0]
+
+
+def test_of_a_large_survey_only_the_next_metres_are_planned_and_no_label_is_told_better_than_it_is():
+    store = make_store(120, 1200, 2.4)
+    survey = replace(survey_of(store), stops=survey_of(store).stops[:70])
+    line = se2_compose(se2_inverse(store.poses[0]), store.poses)[:, :2]
+    study = plan(survey, line, settings=PlanSettings(most_stops=2))
+    assert "metres are planned" in study.plan.notes[0]
+    seen = {s.label for stop in survey.stops for s in stop.sightings}
+    placed = {label.label for label in study.map.labels if label.status == "placed"}
+    assert placed <= {label.label for label in study.plan.labels} <= seen
+    assert len(study.positions) < 0.6 * len(seen)
+    here = survey.stops[-1].stop - 1
+    first = min(study.plan.stops, key=lambda stop: stop.along)
+    true = se2_relative(store.poses[0], store.poses[here])
+    assert np.hypot(first.pose.x - true[0], first.pose.y - true[1]) < 3.0
+    last = study.map.stops[-1].covariance  # what is known of the rest of the store bounds what is known here
+    known = [label for label in study.plan.labels if label.sigma_m is not None]
+    assert min(label.expected_m for label in known if label.expected_m < label.sigma_m) > 0.3 * np.sqrt(last[0][0])
 
 
 def test_a_target_that_is_reached_ends_the_plan(course):

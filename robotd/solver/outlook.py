@@ -13,9 +13,8 @@ from ..geometry.transforms import wrap_angle
 from ..records import Floats, Map
 from .belief import Belief, Views
 from .robust import Optimum
-from .ways import along_line, over_floor
+from .ways import Way
 
-MOST_ENTRIES = 6000  # of a dense covariance: 300 MB
 GUESSES_M = 1.0  # between assumed labels along the way
 _LEAST_WRONG, _MOST_WRONG = 0.005, 0.2  # share of sightings
 _SHOWS = 0.9  # probability that a label is seen which nothing is known to hide
@@ -29,20 +28,31 @@ _NEGLIGIBLE = 0.05  # labels that one may stand for
 _WHEELS = np.array([3e-5, 3e-5, 4e-4])  # m^2, m^2, rad^2 per metre, of a survey without moves
 
 
+def distances(optimum: Optimum) -> tuple[float, float]:
+    """Metres within which lights are found, and the labels' usual distance; raises SolverError if there is no label."""
+    problem, s = optimum.problem, optimum.problem.sightings.select(np.flatnonzero(optimum.inlier))
+    if len(s) == 0:
+        raise SolverError(
+            f"survey {problem.survey.survey}: no label has a position yet; make two stops along the line first"
+        )
+    poses = problem.stop_entries(optimum.state)[:, :2]
+    away = np.hypot(*(poses[s.stop] - optimum.state.points[s.label, :2]).T)
+    return _REACH * float(np.quantile(away, 0.95)) + 0.05, float(np.median(away))
+
+
 class Outlook:
     """A solved survey and where its robot could stop next.
 
     Parameters
     ----------
     optimum : Optimum
+        Of the survey, or of a part of it.
     result : Map
-        What was made of it.
-    line, free, again
-        As `planning.plan` has them.
+        Of the whole survey.
+    way : Way
 
     Attributes
     ----------
-    way : Way
     reach, depth : float
         Metres within which lights are found, and the labels' usual distance.
     stops : (S, 2) array
@@ -62,34 +72,16 @@ class Outlook:
     Raises
     ------
     SolverError
-        If there is nothing to plan from, or too much at once.
+        If there is nothing to plan from.
     """
 
-    def __init__(self, optimum: Optimum, result: Map, line: Floats | None, free: bool, again: bool) -> None:
-        self.optimum, self.map = optimum, result
-        problem, s = optimum.problem, optimum.problem.sightings.select(np.flatnonzero(optimum.inlier))
-        if len(s) == 0:
-            raise SolverError(
-                f"survey {problem.survey.survey}: no label has a position yet; make two stops along the line first"
-            )
+    def __init__(self, optimum: Optimum, result: Map, way: Way) -> None:
+        self.optimum, self.map, self.way = optimum, result, way
+        problem = optimum.problem
         poses = problem.stop_entries(optimum.state)[:, :3]
-        distance = np.hypot(*(poses[s.stop, :2] - optimum.state.points[s.label, :2]).T)
-        self.reach = _REACH * float(np.quantile(distance, 0.95)) + 0.05
-        self.depth = depth = float(np.median(distance))
-        self.stops = poses[:, :2]
-        newest = poses[problem.leg == problem.leg[-1]]
-        if free:
-            self.way = over_floor(newest, optimum.state.points[optimum.adjustment.labels, :2])
-        elif line is None:
-            self.way = along_line(poses[:, :2], newest, poses[0], True, GUESSES_M)
-        else:
-            self.way = along_line(line, newest, poses[0], again, GUESSES_M)
+        self.reach, self.depth = distances(optimum)
+        self.stops, depth = poses[:, :2], self.depth
         guesses, weights, facing = self._guesses(poses, depth)
-        if optimum.adjustment.size + 3 * (len(problem.labels) + len(guesses)) > MOST_ENTRIES:
-            raise SolverError(
-                f"survey {problem.survey.survey}: {len(problem.labels)} labels and {problem.stop_count} stops are too "
-                "many to plan at once; survey the store in parts"
-            )
         self.belief = Belief(optimum, depth, 0.5 * depth, guesses, max(depth, 0.5))
         sigma = float(np.median(problem.sightings.sigma))
         self._directions(poses, facing)

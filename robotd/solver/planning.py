@@ -22,9 +22,11 @@ from ..records import Floats, Map, Pose, Survey
 from ..typed_json import many_records
 from .belief import Rows
 from .mapping import WIDEST_SIGMA_M, to_map
-from .outlook import Outlook
+from .neighbourhood import nearby
+from .outlook import GUESSES_M, Outlook, distances
 from .problem import Ints, build_problem
-from .robust import SLIPPED, optimise
+from .robust import SLIPPED, Optimum, optimise
+from .ways import Way, along_line, over_floor
 
 _WRONG_M = 0.5  # error of a position that is wrong
 _APART = 0.35  # of the labels' usual distance lies between two stops: nearer ones see them from almost the same side
@@ -107,18 +109,33 @@ def plan(
     InputError
         If the survey contradicts itself.
     SolverError
-        If there is nothing to plan from, or too much at once.
+        If there is nothing to plan from, or too much within reach.
     """
     with many_records():
         problem = build_problem(survey)
         optimum = optimise(problem)
-        outlook = Outlook(optimum, to_map(problem, optimum), line, free, again)
-        return _Planner(outlook, settings or PlanSettings()).study()
+        result, (reach, _) = to_map(problem, optimum), distances(optimum)
+        way = _way(optimum, line, free, again)
+        settings = settings or PlanSettings()
+        near, way, note = nearby(optimum, result, way, settings.most_stops * _LONGEST * reach, reach)
+        return _Planner(Outlook(near, result, way), settings, () if note is None else (note,)).study()
+
+
+def _way(optimum: Optimum, line: Floats | None, free: bool, again: bool) -> Way:
+    """Where the robot can go, in the map's axes."""
+    problem = optimum.problem
+    poses = problem.stop_entries(optimum.state)[:, :3]
+    newest = poses[problem.leg == problem.leg[-1]]
+    if free:
+        return over_floor(newest, optimum.state.points[optimum.adjustment.labels, :2])
+    if line is None:
+        return along_line(poses[:, :2], newest, poses[0], True, GUESSES_M)
+    return along_line(line, newest, poses[0], again, GUESSES_M)
 
 
 class _Planner:
-    def __init__(self, outlook: Outlook, settings: PlanSettings) -> None:
-        self.outlook, self.settings = outlook, settings
+    def __init__(self, outlook: Outlook, settings: PlanSettings, notes: tuple[str, ...]) -> None:
+        self.outlook, self.settings, self.notes = outlook, settings, notes
         self.optimum, self.belief, self.way = outlook.optimum, outlook.belief, outlook.way
         self.views, self.chance, self.weights = outlook.views, outlook.chance, outlook.weights
         self.places = self.way.places
@@ -333,14 +350,25 @@ class _Planner:
         belief, problem, way = self.belief, self.optimum.problem, self.way
         count = len(problem.labels)
         flashes, skipped = list[tuple[PlannedFlash, ...]](), list[tuple[str, ...]]()
-        P, agreeing = first, self.outlook.agreeing
-        for k, choice in enumerate(at):
-            P, agreeing, _ = self._with(at[: k + 1], first)
-            sigma = np.sqrt(belief.traces(P))
+        now = {
+            label.label: None if label.covariance is None else float(np.sqrt(np.trace(np.array(label.covariance))))
+            for label in self.outlook.map.labels
+            if label.status in ("placed", "known")
+        }
+        # what the whole survey knows less well than the stops around do, as these hang on stops elsewhere
+        whole = np.array([now.get(label) or 0.0 for label in problem.labels])
+        elsewhere = np.maximum(whole**2 - belief.traces(first)[:count], 0.0)
+        P, done = first, list[_Choice]()
+        for choice in at:
+            P, entry = belief.with_stop(P)
+            done.append(replace(choice, entry=entry, link=self._link(choice.place, done, entry)))
+            P = belief.take(P, self._rows(done[-1]))
+            sigma = np.sqrt(np.maximum(belief.traces(P)[:count], 0.0) + elsewhere)
             labels = np.unique(self.views.label[choice.asked])
             in_view = np.unique(self.views.label[self.views.at(choice.place)])
             flashes.append(tuple(PlannedFlash(problem.labels[i], float(sigma[i])) for i in labels if i < count))
             skipped.append(tuple(problem.labels[i] for i in np.setdiff1d(in_view, labels) if i < count))
+        _, agreeing, _ = self._with(at, first)
         stops = tuple(
             PlannedStop(
                 None if np.isnan(way.along[choice.place]) else float(way.along[choice.place]),
@@ -350,20 +378,16 @@ class _Planner:
             )
             for choice, asked, left_out in zip(at, flashes, skipped, strict=True)
         )
-        now = {
-            label.label: None if label.covariance is None else float(np.sqrt(np.trace(np.array(label.covariance))))
-            for label in self.outlook.map.labels
-            if label.status in ("placed", "known")
-        }
-        expected = np.sqrt(np.maximum(belief.traces(P), 0.0))
-        there = np.isfinite(belief.points[:count, 0])
-        labels_ = tuple(
+        expected = np.sqrt(np.maximum(belief.traces(P)[:count], 0.0) + elsewhere)
+        labels_ = [
             PlannedLabel(problem.labels[i], now.get(problem.labels[i]), float(expected[i]))
-            for i in np.flatnonzero(there)
-        )
+            for i in np.flatnonzero(np.isfinite(belief.points[:count, 0]))
+        ]
+        here = set(problem.labels)
+        labels_ += [PlannedLabel(name, value, value) for name, value in now.items() if value and name not in here]
         begin = 0.0 if way.here is None else way.here
         notes = self._notes(at, self._is_done(P, agreeing))
-        result = Plan(problem.survey.survey, stops, labels_, notes, begin)
+        result = Plan(problem.survey.survey, stops, tuple(labels_), notes, begin)
         return Study(
             result,
             self.outlook.map,
@@ -397,4 +421,4 @@ class _Planner:
             notes.append(f"no other stop would lower the labels' uncertainty by {100 * settings.least:.0f} %")
         if self.way.here is None:
             notes.append("the stops are for a new leg, from the line's beginning")
-        return tuple(notes)
+        return (*self.notes, *notes)

@@ -24,7 +24,7 @@ def draw_rig(path: Path, result: RigCalibration) -> None:
     InputError
         If the file cannot be written or matplotlib is not installed.
     """
-    columns = min(len(result.cameras), 3) + 1
+    columns = (2 if len(result.cameras) == 4 else min(len(result.cameras), 3)) + 1
     rows = -(-len(result.cameras) // (columns - 1))
     figure = new_figure(path, 4.4 * columns, 3.9 * rows + 1.0, 110.0)
     from matplotlib.patches import Circle

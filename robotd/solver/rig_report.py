@@ -43,8 +43,8 @@ def report(result: RigCalibration) -> str:
     if result.slope > 0.0:
         stops = math.ceil((result.slope / _WANTED) ** 2)
         lines.append(
-            f"roll and pitch rest on the floor, whose slope differs by {np.degrees(result.slope):.2f} degrees from stop "
-            f"to stop: {result.stops} stops show them to +- {np.degrees(result.floor_sigma):.3f} degrees at best, "
+            f"roll and pitch rest on the floor, whose slope differs by {np.degrees(result.slope):.2f} degrees from "
+            f"stop to stop: {result.stops} stops show them to +- {np.degrees(result.floor_sigma):.3f} degrees at best, "
             f"{stops} to {np.degrees(_WANTED):.2f}"
         )
     for name, (x, y, _) in result.beacons.items():
