@@ -13,12 +13,13 @@ from robotd.bind import ranged
 from robotd.bus import Bus, Subscription
 from robotd.clock import in_thread, now
 from robotd.config import Calibration
-from robotd.errors import ConfigError, MissionError
+from robotd.errors import ConfigError, DriverFault, MissionError
 from robotd.follow import SLOW_AFTER, FollowConfig, PathFollower, Steering
 from robotd.hardware import CameraMode, Hardware
 from robotd.lost_line import BLIND_S, LostLine
 from robotd.plugin import Driver, FollowEnd
 from robotd.records import (
+    CameraModel,
     DriveCommand,
     Frame,
     Line,
@@ -26,6 +27,7 @@ from robotd.records import (
     LineState,
     LineStatus,
     OdometryState,
+    Transform,
     Withdrawal,
 )
 from robotd.vision.line_eye import SURE_CONFIDENCE, LineEye
@@ -40,6 +42,10 @@ STANDSTILL_S = 0.15  # longer than the window over which odometry takes its spee
 SEARCH_LEAST = 0.15  # metres of remembered line in view that are worth a closer look
 SEARCH_NEAR = 0.10  # metres to either side of the prediction
 END_SLACK = 0.10  # metres before a stop at which the line may end: odometry's error after a long drive
+# about where a floor camera is: for its pictures' size, until it is calibrated
+UNCALIBRATED = CameraModel(
+    "floor", (320, 240), (228.5, 228.5, 159.5, 119.5), Transform((-1.643, 1.643, -0.855), (0.12, 0.0, 0.3))
+)
 MARK_NEAR, MARK_FAR = 1.0, 0.30  # line widths and metres from the line's middle between which a marker is ours
 SAME_MARK = 0.15  # metres behind a marker in which it is the one at which the robot stands
 
@@ -99,11 +105,8 @@ class LineFollowerDriver(Driver):
         super().__init__(name, config, hardware, bus, calibration)
         rig = {camera.name: camera for camera in calibration.cameras}
         model = rig.get(config.camera, calibration.floor_camera)
-        if model is None:
-            raise ConfigError(
-                f"{name}: the calibration has neither a camera '{config.camera}' in its rig nor a [floor_camera];"
-                f" calibrate '{config.camera}' first"
-            )
+        self._is_calibrated = model is not None
+        model = model or UNCALIBRATED
         try:
             self._eye = LineEye(
                 model,
@@ -149,7 +152,18 @@ class LineFollowerDriver(Driver):
         self._at_mark = -math.inf  # metres travelled at the last marker
 
     async def open(self) -> None:
-        """Start without any memory; the camera belongs to a driver of its own."""
+        """Start without any memory; the camera belongs to a driver of its own.
+
+        Raises
+        ------
+        DriverFault
+            Nobody knows where the camera is; all else works meanwhile, so that it can be calibrated.
+        """
+        if not self._is_calibrated:
+            raise DriverFault(
+                f"the calibration has neither a camera '{self.config.camera}' in its rig nor a [floor_camera]; "
+                "robotctl calibrate floor collects what it takes, then restart robotd"
+            )
         self._forget()
 
     async def close(self) -> None:

@@ -12,7 +12,7 @@ import contextlib
 import logging
 from collections import Counter
 from collections.abc import Coroutine, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, cast
@@ -66,11 +66,13 @@ class Assembly:
     eye: Driver  # the follower's camera
     beacons: Driver | None = None
     serial_log: SerialLog | None = None
+    others: Mapping[str, Driver] = field(default_factory=dict)  # cameras to be calibrated: missions do without them
 
     @property
     def drivers(self) -> list[Driver]:
         """In the order in which they are opened."""
         every = [self.base, *self.cameras.values(), self.eye, self.labels, self.follower, self.beacons]
+        every += self.others.values()
         return list(dict.fromkeys(driver for driver in every if driver is not None))
 
 
@@ -172,7 +174,8 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
     Raises
     ------
     ConfigError
-        Lists every mistake of the configuration, of its drivers' sections and of the calibration.
+        Lists every mistake of the configuration, of its drivers' sections and of the calibration, which need not
+        exist: nothing is known then.
     """
     problems: list[str] = []
     read = collect(problems, lambda: read_config(path))
@@ -181,7 +184,8 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
     calibration = Calibration()
     if config is not None:
         where = path.parent / config.robot.calibration
-        calibration = collect(problems, lambda: load_calibration(where)) or calibration
+        if where.exists():
+            calibration = collect(problems, lambda: load_calibration(where)) or calibration
     if problems or config is None:
         raise ConfigError(*problems)
     cameras = _of_kind(plans, "camera")
@@ -209,7 +213,10 @@ def assemble(path: Path, hardware: Hardware) -> Assembly:
     rig = {camera.name: drivers[camera.name] for camera in calibration.cameras}
     eye = drivers[str(plans[follower.name].config.camera)]
     beacons = next((drivers[name] for name in _of_kind(plans, "beacons")), None)
-    return Assembly(path, config, calibration, bus, hardware, base, follower, labels, rig, eye, beacons, serial_log)
+    others = {name: drivers[name] for name in cameras if name not in rig and name != eye.name}
+    return Assembly(
+        *(path, config, calibration, bus, hardware, base, follower, labels, rig, eye, beacons, serial_log, others)
+    )
 
 
 def _check_groups(path: Path, config: Config, calibration: Calibration) -> list[str]:
@@ -217,7 +224,7 @@ def _check_groups(path: Path, config: Config, calibration: Calibration) -> list[
     groups = config.mission.camera_groups
     named = Counter(name for group in groups for name in group)
     rig = {camera.name for camera in calibration.cameras}
-    if not groups or (named.keys() == rig and max(named.values()) == 1):
+    if not (groups and rig) or (named.keys() == rig and max(named.values()) == 1):
         return []
     found = ", ".join(name for group in groups for name in group)
     return [f"{path} mission.camera_groups: found {found}; expected each of {', '.join(sorted(rig))} once"]
@@ -287,6 +294,8 @@ class Daemon:
         self.journal = journal = await in_thread(Journal.open, self.state / "journal.sqlite")
         try:
             await self._note_clock()
+            if not (assembly.path.parent / (name := assembly.config.robot.calibration)).exists():
+                log.warning("there is no %s yet: calibrate the robot (robotctl calibrate), then restart robotd", name)
             uploader = self._uploader()
             async with asyncio.TaskGroup() as self._group:
                 work = [
@@ -359,8 +368,8 @@ class Daemon:
         assembly, mission = self.assembly, self.assembly.config.mission
         exposure = flicker_free(mission.identify.exposure_s, mission.mains_hz)
         standing = CameraMode(exposure=exposure, mains_hz=mission.mains_hz)
-        cameras = dict(assembly.cameras)
-        cameras.setdefault(assembly.eye.name, assembly.eye)
+        follower = cast(Follower, assembly.follower)
+        cameras = {**assembly.cameras, **assembly.others, assembly.eye.name: assembly.eye}
         recording = assembly.config.recording
 
         def is_busy() -> bool:
@@ -374,7 +383,7 @@ class Daemon:
             hardware=assembly.hardware,
             calibration=assembly.calibration,
             cameras={name: cast(Camera, driver) for name, driver in cameras.items()},
-            mode=lambda name: standing if name in assembly.cameras else cast(Follower, assembly.follower).mode,
+            mode=lambda name: follower.mode if name == assembly.eye.name and name not in assembly.cameras else standing,
             groups=mission.camera_groups,
             pattern=mission.identify.pattern,
             is_busy=is_busy,
@@ -414,8 +423,9 @@ class Daemon:
         return recordings
 
     def fault(self) -> str | None:
-        """Why a device does not work now, in words."""
-        return next((supervisor.fault for supervisor in self.supervisors if supervisor.fault is not None), None)
+        """Why a device that missions need does not work now, in words."""
+        needed = (item for item in self.supervisors if item.driver.name not in self.assembly.others)
+        return next((item.fault for item in needed if item.fault is not None), None)
 
     async def _log_events(self, journal: Journal) -> None:
         with self.assembly.bus.events.subscribe(size=256) as events:

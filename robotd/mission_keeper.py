@@ -188,6 +188,11 @@ class MissionKeeper:
     async def _begin(self, survey: str | None, **how: Any) -> None:
         daemon = self.daemon
         assembly, config = daemon.assembly, daemon.assembly.config
+        if assembly.others and not assembly.cameras:
+            raise InputError(
+                f"{config.robot.calibration} knows no camera of the rig; robotctl calibrate camera "
+                f"{' and '.join(assembly.others)}, and robotctl calibrate rig"
+            )
         limits = config.mission
         self._battery = BatteryGuard(limits.low_charge, limits.enough_charge, limits.low_voltage, limits.enough_voltage)
         self._disk = DiskGuard(str(daemon.state), 1e6 * limits.keep_free_mb)

@@ -238,13 +238,16 @@ def test_labels_that_no_stop_saw_are_in_the_map_with_their_reason():
 # ---- as a service ----------------------------------------------------------------------------------------------------
 
 
-def test_without_any_device_the_daemon_reports_retries_and_ends_cleanly(tmp_path):
+@pytest.mark.parametrize("is_calibrated", [True, False])
+def test_without_any_device_the_daemon_reports_retries_and_ends_cleanly(tmp_path, is_calibrated):
     text = EXAMPLE.read_text().replace("labels.example", "127.0.0.1").replace("port = 7071", "port = 9")
     camera = CameraModel("floor", (320, 240), (228.5, 228.5, 159.5, 119.5), FLOOR_MOUNT)
     rig = [replace(CAMERA, name=name) for name in ("front", "left", "rear", "right")]
-    text = text.replace("[robot]\n", '[robot]\nstate_directory = "state"\ncalibration = "calibration.toml"\n')
+    given = '[robot]\nstate_directory = "state"\ncalibration = "calibration.toml"\ncontrol = "control.sock"\n'
+    text = text.replace("[robot]\n", given)
     (tmp_path / "robotd.toml").write_text(text)
-    save_calibration(Calibration(cameras=tuple(rig), floor_camera=camera), tmp_path / "calibration.toml")
+    if is_calibrated:
+        save_calibration(Calibration(cameras=tuple(rig), floor_camera=camera), tmp_path / "calibration.toml")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(60.0)
@@ -259,6 +262,13 @@ def test_without_any_device_the_daemon_reports_retries_and_ends_cleanly(tmp_path
                 process.kill()
                 raise
             missing = {"base", "front", "left", "rear", "right", "floor", "labels"}
+            if not is_calibrated:  # what it takes to calibrate it works
+                missing |= {"follower", "WARNING there is no calibration.toml yet"}
+                command = [sys.executable, "-m", "robotd.ctl.main", "--socket", str(tmp_path / "control.sock")]
+                start = subprocess.run([*command, "mission", "start"], capture_output=True, text=True, check=False)
+                assert start.returncode == 1
+                words = "robotctl calibrate camera front and left and rear and right, and robotctl calibrate rig"
+                assert words in start.stderr
             while missing:  # every device is reported, one after the other
                 line = process.stderr.readline()
                 assert line, f"ended before it complained of {missing}"
