@@ -2,8 +2,9 @@
 
 The likelihood has many maxima, one for every way in which some lights fit by accident. So it is taken on a grid over
 what is held possible, with a step that moves the end of the longest queue by less than delays differ: the true
-maximum is not stepped over. Few lights decide, and for each of them those labels whose durations fit its flashes: that
-does not depend on the throughput, and leaves an eighth of a queue after one slot and a handful after two.
+maximum is not stepped over. Every light counts, because a dozen fit a wrong throughput by accident; but of its labels
+only those whose durations fit its flashes are tried: that does not depend on the throughput, and leaves an eighth of a
+queue after one slot and a handful after two.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from ..records import Floats
 from .decoder import Evidence, Numbers, Prior, chances
 from .delays import DelayModel, Kernel
 
-LIGHTS = 12  # that decide: those that flashed most often
-PAIRS = 1500  # labels that are tried for each of them, at most
+LABELS = 1500  # tried for each light, at most
+PAIRS, LIGHTS = 45_000, 12  # pairs of light and label, above which no further light is taken, but so many in any case
 WORTH = 10.5  # log-likelihood below the best one, if all moments fitted, of labels that are tried: one lost command
 
 
@@ -31,7 +32,7 @@ def search_interval(evidence: Sequence[Evidence], prior: Prior, delays: DelayMod
     flashed = np.zeros(lights)
     for slot in evidence:
         flashed[: len(slot.scores)] += slot.scores.max(axis=1, initial=0.0) > 3.0
-    chosen = np.sort(np.argsort(-flashed, kind="stable")[:LIGHTS])
+    chosen = np.argsort(-flashed, kind="stable")
     kernels = [delays.kernel(slot.begun, delays.fetch(slot.begun), slot.window) for slot in evidence]
     owner, labels, fixed, ends = _pairs(evidence, prior, chosen, kernels, delays)
     parts = [_Part(slot, kernel, chosen, owner, labels, delays) for slot, kernel in zip(evidence, kernels, strict=True)]
@@ -84,9 +85,9 @@ class _Part:
 def _pairs(
     evidence: Sequence[Evidence], prior: Prior, chosen: Numbers, kernels: Sequence[Kernel], delays: DelayModel
 ) -> tuple[Numbers, Numbers, Floats, Numbers]:
-    """Which labels are tried for the `chosen` lights: per pair the light's number among them, the label (-1: none of
-    ours, or any other label at any moment), the log-likelihood that does not depend on the interval; and where each
-    light's pairs begin."""
+    """Which labels are tried for the first of the `chosen` lights: per pair the light's number among them, the label
+    (-1: none of ours, or any other label at any moment), the log-likelihood that does not depend on the interval; and
+    where each light's pairs begin."""
     config = delays.config
     weights = prior.weights / max(float(prior.weights.sum()), 1e-30)
     ours = np.log(np.maximum((1.0 - config.none_fraction) * weights, 1e-30))
@@ -106,7 +107,7 @@ def _pairs(
                 usual[slot.labels] += np.log(np.maximum(match + instead, 1e-30))
                 nobody += math.log(none[0])
             found = len(slot.scores)
-        kept = _best(most, PAIRS)
+        kept = _best(most, LABELS)
         rest = np.ones(len(most), bool)
         rest[kept] = False
         others = float(np.logaddexp.reduce(usual[rest], initial=nobody))
@@ -115,6 +116,8 @@ def _pairs(
         fixed.append(np.append(base[kept], others))
         ends.append(begin)
         begin += len(kept) + 1
+        if begin > PAIRS and number + 1 >= LIGHTS:
+            break
     return np.concatenate(owner), np.concatenate(labels), np.concatenate(fixed), np.array(ends, np.intp)
 
 
