@@ -143,7 +143,8 @@ class RoofWatch:
     Attributes
     ----------
     odometry : OdometryTrack
-        Whoever has the robot's dead reckoning may add it, for beacons that move fast.
+        Whoever has the robot's dead reckoning may add it. `robotd-solver roof watch` has none: there is no line to the
+        robot, stops are joined by their dates, and moving beacons are followed by their own course as well.
 
     Raises
     ------

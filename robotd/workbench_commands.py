@@ -33,6 +33,7 @@ from .workbench.tune import Trial, parse_range, score_set, shared
 from .workbench.tune import tune as search
 
 QUANTILES = (5, 25, 50, 75, 95)
+_LATE_S = 1.0  # after the last frame, that may still be asked for
 
 
 def info(arguments: argparse.Namespace) -> int:
@@ -209,6 +210,10 @@ def show(arguments: argparse.Namespace) -> int:
             break
     if last is None:
         raise InputError(f"{tagged.name}: has no frame from {arguments.since:g} s on")
+    if arguments.at is not None and arguments.at > last.shot.t + _LATE_S:
+        raise InputError(f"--at {arguments.at:g}: {tagged.name} ends at {last.shot.t:.2f} s")
+    if arguments.frame is not None and arguments.frame > last.number:
+        raise InputError(f"--frame {arguments.frame}: {tagged.name} has frames 0 to {last.number}")
     shot, explained, flashes = last.shot, detector.explain(), detector.flashes()
     tags = [tag for tag in tagged.tags if tag.share(arguments.since, max(shot.t, 1e-6)) > 0.0]
     seen = pictures.Seen(tags, flashes)

@@ -17,16 +17,19 @@ Parser = argparse.ArgumentParser
 
 def add(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add `workbench` and its commands to a command line."""
+    footage = (
+        "FOOTAGE is a recording (.mcap), a folder of images or a video; marks lie beside it, in"
+        " FOOTAGE.tags.toml. Times are seconds after the first frame."
+    )
     bench = commands.add_parser(
         "workbench",
         help="footage of flashing labels: play, tag, run detectors, show, score, tune, export",
-        description="FOOTAGE is a recording (.mcap), a folder of images or a video; marks lie beside it, in"
-        " FOOTAGE.tags.toml. Times are seconds after the first frame.",
+        description=footage,
     )
     parts = bench.add_subparsers(dest="what", required=True, metavar="COMMAND")
 
     def command(name: str, help_: str, several: bool = False) -> Parser:
-        parser = parts.add_parser(name, help=help_)
+        parser = parts.add_parser(name, help=help_, description=f"{help_.capitalize()}. {footage}")
         if several:
             parser.add_argument("footage", nargs="+", type=Path, metavar="FOOTAGE")
         else:
@@ -76,7 +79,7 @@ def add(commands: argparse._SubParsersAction[Parser]) -> None:
     _footage(show)
     _detector(show)
     when = show.add_mutually_exclusive_group()
-    when.add_argument("--at", type=_seconds, metavar="S", help="the frame then (default: the last)")
+    when.add_argument("--at", type=_seconds, metavar="S", help="the last frame until then (default: of all)")
     when.add_argument("--frame", type=_count, metavar="N", help="the frame of this number, from 0")
     show.add_argument("--since", type=_seconds, default=0.0, metavar="S", help="the detector begins then")
     show.add_argument("--place", type=_place, metavar="U,V", help="also the course of this place")

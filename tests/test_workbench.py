@@ -346,6 +346,9 @@ def test_the_reaction_to_a_frame_and_the_course_of_a_place_are_drawn(tmp_path, c
     assert picture.shape[1] > 2000
     assert picture.std() > 20
     assert "no mark 9; there are 3" in refused(capsys, "show", shelf, "--mark", "9", "-o", tmp_path / "y.png")
+    late = refused(capsys, "show", shelf, "--at", "99", "-o", tmp_path / "y.png")
+    assert "--at 99: " in late
+    assert "ends at " in late
 
 
 def test_playing_keeps_the_pace_of_the_footage(shelf):

@@ -120,7 +120,7 @@ def _why_not(detector: FlashDetector, matches: Matches, k: int, threshold: float
     config, why = detector.config, []
     if matches.score[k] < threshold:
         why.append("score too low")
-    if matches.margin[k] < config.min_margin:
+    elif matches.margin[k] < config.min_margin:
         why.append(f"steady blinking: margin {matches.margin[k]:.1f}")
     if not matches.regular[k]:
         why.append("a period lacks the pattern")
