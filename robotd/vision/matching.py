@@ -87,6 +87,8 @@ class Matcher:
         self._exposure = exposure
         self._template = Template(pattern, exposure)
         self._steady_hz = steady_hz
+        self._sampled: tuple[int, float] | None = None  # number of frames and seconds for which `_is_rival` holds
+        self._is_rival = np.zeros(0, bool)
         shortest = min(end - start for start, end in pattern.on)
         self._step = max(8, int(np.ceil(pattern.period / min(0.02, max(0.004, 0.3 * shortest)))))
 
@@ -297,18 +299,25 @@ class Matcher:
         """What the best steady blinking (three harmonics, any rate) leaves of each light curve's energy."""
         if not len(y):
             return energy
-        seconds = max(float(times[-1] - times[0]), 1e-3)
-        rates = np.arange(*self._steady_hz, 0.5 / seconds)  # half a turn from one to the next, over the whole window
-        turns = np.exp(2j * np.pi * rates[:, None] * (times - times[0]))
-        # those that are as good as the pattern are no rivals
-        whole = int(seconds / self._pattern.period) + 2
-        wave = self._pattern.coverage(times - times[0] + self._pattern.period, self._exposure, whole)
-        wave = (wave - wave.mean())[None].astype(np.float32)
-        alike = _explained(wave, np.ones_like(wave), turns)[0]
-        turns = turns[alike <= _ALIKE * float(wave[0] @ wave[0])]
+        turns = self._rivals(times)
         if not len(turns):
             return energy
         return np.asarray(np.maximum(energy - _explained(y, weights, turns).max(axis=1), 1e-6))
+
+    def _rivals(self, times: Floats) -> NDArray[np.complex64]:
+        """exp(i 2 pi rate t) (H, F) for H rates of steady blinking, but for those that are as good as the pattern."""
+        seconds = max(float(times[-1] - times[0]), 1e-3)
+        rates = np.arange(*self._steady_hz, 0.5 / seconds)  # half a turn from one to the next, over the whole window
+        turns = np.exp(2j * np.pi * rates[:, None] * (times - times[0])).astype(np.complex64)
+        sampled = len(times), round(seconds, 1)
+        if self._sampled != sampled:
+            whole = int(seconds / self._pattern.period) + 2
+            wave = self._pattern.coverage(times - times[0] + self._pattern.period, self._exposure, whole)
+            wave = (wave - wave.mean())[None].astype(np.float32)
+            alike = _explained(wave, np.ones_like(wave), turns)[0]
+            self._sampled, self._is_rival = sampled, alike <= _ALIKE * float(wave[0] @ wave[0])
+        is_rival = self._is_rival[: len(turns)]
+        return np.asarray(turns[: len(is_rival)][is_rival])
 
 
 def _regressed(y: Singles, weights: Singles, frames: Singles, wave: Singles) -> tuple[Singles, Singles, Singles]:
@@ -389,7 +398,7 @@ def _without(values: Singles, weights: Singles, basis: Singles) -> Singles:
     return np.asarray(values - factors @ b.T, np.float32)
 
 
-def _explained(y: Singles, weights: Singles, turns: NDArray[np.complex128]) -> Floats:
+def _explained(y: Singles, weights: Singles, turns: NDArray[np.complex64]) -> Floats:
     """Energy (N, H) that a constant and _HARMONICS harmonics of each of H rates explain of light curves.
 
     Parameters
@@ -403,8 +412,10 @@ def _explained(y: Singles, weights: Singles, turns: NDArray[np.complex128]) -> F
     -----
     Least squares in the basis of exp(i k 2 pi rate t), whose normal matrix is Toeplitz.
     """
-    powers = np.arange(2 * _HARMONICS + 1)
-    waves = turns[:, None, :] ** powers[:, None]
+    waves = np.empty((len(turns), 2 * _HARMONICS + 1, turns.shape[1]), np.complex64)
+    waves[:, 0] = 1.0
+    for k in range(2 * _HARMONICS):
+        np.multiply(waves[:, k], turns, out=waves[:, k + 1])
     sums = np.einsum("nf,hkf->nhk", weights, waves)
     sums = np.concatenate([sums[:, :, :0:-1].conj(), sums], axis=2)  # of the powers -2 _HARMONICS to 2 _HARMONICS
     right = np.einsum("nf,hkf->nhk", y, waves[:, : _HARMONICS + 1].conj())
