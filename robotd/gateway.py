@@ -79,6 +79,7 @@ class Outbox:
         self._since: dict[str, float] = {}  # when files were first seen in the folder, in the caller's clock
         self.held: deque[str] = deque()  # names of files that wait for their guard time
         self._latest = -math.inf  # when the latest file went into the folder, in the caller's clock
+        self._failed = False  # the latest file could not be written
         self.work = folder / ".robotd-labels"
         self.log = self.work / "log"
         self.template = template
@@ -135,6 +136,7 @@ class Outbox:
             with suppress(OSError):
                 path.unlink()  # a restart must not obey what is refused now,
                 self._note({"file": name, "key": key, "withdrawn": True})  # nor take it for done if it is asked again
+            self._failed = True
             raise RefusedError(f"{self.folder} cannot be written: {error.strerror or error}") from error
         self._remember(key)
 
@@ -179,6 +181,19 @@ class Outbox:
             )
         if not os.access(self.folder, os.W_OK) or not os.access(self.work, os.W_OK):
             return f"{self.folder} cannot be written; give this program's user the right to"
+        return self._still_failing() if self._failed else None
+
+    def _still_failing(self) -> str | None:
+        """Why what could not be written would fail again, by trying."""
+        probe = self.work / "probe"
+        try:
+            _write(probe, "wb", bytes(4096))
+        except OSError as error:
+            return f"{self.folder} cannot be written: {error.strerror or error}"
+        finally:
+            with suppress(OSError):
+                probe.unlink(missing_ok=True)
+        self._failed = False
         return None
 
     def _note(self, entry: dict[str, Any]) -> None:

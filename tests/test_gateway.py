@@ -139,6 +139,22 @@ def test_a_request_that_was_refused_may_be_made_again_under_its_key(tmp_path, mo
     assert len(files(tmp_path)) == 1
 
 
+def test_status_tells_of_a_full_disk_until_there_is_room(desk, tmp_path, monkeypatch):
+    plain = gateway._write
+
+    def full(path, mode, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(gateway, "_write", full)
+    assert "No space left" in ask(desk, FLASH)["error"]
+    status = {"token": TOKEN, "method": "status"}
+    assert ask(desk, status)["trouble"].endswith("cannot be written: No space left on device")
+    monkeypatch.setattr(gateway, "_write", plain)
+    assert ask(desk, status)["trouble"] is None
+    assert ask(desk, FLASH)["ok"]
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["robotd-000000000001.txt"]
+
+
 def test_a_file_that_windows_holds_for_a_moment_is_renamed_all_the_same(tmp_path, monkeypatch):
     desk = make_desk(tmp_path)
     rename, refusals = os.replace, iter([True, True, False])

@@ -52,6 +52,13 @@ def test_a_first_stop_learns_how_many_commands_a_second_the_system_sends(rate):
     assert outcome.right >= 26
 
 
+def test_no_wrong_throughput_is_believed_that_a_dozen_lights_fit_by_accident():
+    for outcome in coded_stops(1000, 60, ONE, [21]):
+        assert outcome.right >= 35
+        assert outcome.undecided <= 2
+        assert 1.0 / outcome.inquiry.delays.interval == pytest.approx(10.0, rel=0.03)
+
+
 def test_labels_seen_before_are_named_by_their_place_in_a_short_stop():
     survey = store(3, EIGHT, number=160, stops=9, given=8)
     assert len(survey.per_stop) == 1
