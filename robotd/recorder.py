@@ -247,7 +247,7 @@ class Recordings:
         Parameters
         ----------
         cameras : sequence of str
-            Default: every camera of the rig, or the first group of them.
+            Default: every camera of the rig, or the first group of them; without a calibrated rig all there are.
         name : str, optional
             Of the file, without ".mcap"; default: robot and date.
         seconds, limit_mb, raw
@@ -260,7 +260,7 @@ class Recordings:
         """
         if not self._is_idle.is_set():
             raise InputError(f"a recording is being made already: {self._last and self._last.path.stem}; stop it first")
-        chosen = tuple(dict.fromkeys(cameras)) or (self.groups[0] if self.groups else tuple(self._rig))
+        chosen = tuple(dict.fromkeys(cameras)) or (self.groups[0] if self.groups else tuple(self._rig or self.cameras))
         name = name or f"{_plain(self.robot)}-{self.hardware.utc().astimezone(UTC):%Y%m%dT%H%M%SZ}"
         problems = [*self._check_cameras(chosen), *self._check_name(name)]
         config = self.config

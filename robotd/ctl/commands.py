@@ -92,11 +92,14 @@ def status_text(answer: dict[str, Any]) -> str:
 
 def _uploads_text(uploads: dict[str, Any]) -> str:
     if uploads["url"] is None:
-        return f"no server is configured; {uploads['waiting']} records wait"
-    text = (
-        f"{uploads['waiting']} records wait for {uploads['url']}" if uploads["waiting"] else f"all at {uploads['url']}"
-    )
+        return f"no server is configured; {_count(uploads['waiting'], 'record')} to send"
+    waiting = f"{_count(uploads['waiting'], 'record')} to send to" if uploads["waiting"] else "all at"
+    text = f"{waiting} {uploads['url']}"
     return f"{text}; {uploads['trouble']}" if uploads["trouble"] else text
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _drivers_text(drivers: list[dict[str, Any]]) -> str:
@@ -193,8 +196,7 @@ def mission_resume(arguments: Namespace) -> int:
 
 def mission_abort(arguments: Namespace) -> int:
     answer = ask(arguments, "mission.abort")
-    stops = answer["stops"]
-    return _say(arguments, answer, f"aborted; {stops} stop{' is' if stops == 1 else 's are'} kept")
+    return _say(arguments, answer, f"aborted; {_count(answer['stops'], 'stop')} kept")
 
 
 def mission_status(arguments: Namespace) -> int:

@@ -240,7 +240,7 @@ async def _camera(operations: Operations, person: _Person, wanted: Calibration) 
     album = _Album(operations, wanted, camera=camera.name)
     how = "hold the chessboard anew: near and far, tilted, and into each corner of the view."
     good = await _boards(operations, person, album, camera, wanted.pictures, how)
-    return await album.finish(f"{good} pictures of the board in {{folder}}")
+    return await album.finish(_boards_text(good, f"camera {{folder}}/*.png --camera {camera.name}", operations, wanted))
 
 
 async def _floor(operations: Operations, person: _Person, wanted: Calibration) -> Any:
@@ -249,11 +249,21 @@ async def _floor(operations: Operations, person: _Person, wanted: Calibration) -
     album = _Album(operations, wanted, camera=camera.name)
     how = "lay the chessboard flat on the floor, wholly in view, anew each time; measure where the first one lies."
     good = await _boards(operations, person, album, camera, wanted.pictures, how)
-    command = (
-        f"robotd-solver calibrate floor {{folder}}/*.png --board {wanted.columns}x{wanted.rows} "
-        f"--square {wanted.square:g} --at X,Y,DEG --calibration {robot.assembly.config.robot.calibration}"
+    return await album.finish(_boards_text(good, "floor {folder}/*.png --at X,Y,DEG", operations, wanted))
+
+
+def _boards_text(good: int, command: str, operations: Operations, wanted: Calibration) -> str:
+    """What came of it, and what to do with it; raises MissionError if the board was in no picture."""
+    size = f"{wanted.columns}x{wanted.rows}"
+    if not good:
+        raise MissionError(
+            f"no picture shows a whole board of {size} inner corners; count them (--board), hold it still in good light"
+        )
+    file = operations.robot.assembly.config.robot.calibration
+    return (
+        f"{good} pictures of the board in {{folder}}\n"
+        f"now: robotd-solver calibrate {command} --board {size} --square {wanted.square:g} --calibration {file}"
     )
-    return await album.finish(f"{good} pictures of the board in {{folder}}\nnow: {command}")
 
 
 async def _rig(operations: Operations, person: _Person, wanted: Calibration) -> Any:
