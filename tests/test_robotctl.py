@@ -81,6 +81,9 @@ def test_what_the_robot_refuses_is_said_and_has_an_exit_code(robot):
     assert wrong.returncode == 2
     assert "invalid choice: 'strat'" in wrong.stderr
     assert robotctl(robot, "stops", "show", "x.y").returncode == 2
+    both = robotctl(robot, "-H", "ssh://nobody@127.0.0.1", "--socket", "x", "status")
+    assert (both.returncode, both.stdout) == (2, "")
+    assert "--socket is of robotd here" in both.stderr
     assert "there is no driver 'nose'" in robotctl(robot, "drivers", "restart", "nose").stderr
     assert robotctl(robot, "estop").returncode == 0
     assert "emergency stop" in robotctl(robot, "status").stdout

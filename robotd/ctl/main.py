@@ -269,6 +269,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.host = arguments.host or os.environ.get("ROBOTCTL_HOST") or None
     module, _, function = arguments.function.partition(".")
     try:
+        if arguments.host and arguments.socket:
+            raise CtlError(
+                USAGE, "--socket is of robotd here; at the far end of -H set ROBOTCTL_SOCKET, or leave it out"
+            )
         found = __import__(f"robotd.ctl.{module}", fromlist=[function])
         return int(getattr(found, function)(arguments))
     except CtlError as error:
