@@ -198,7 +198,7 @@ class FlashDetector:
         if waiting >= _FEW or (waiting and not self.tracks):
             self._decide(self._times[-1][1])
         if self._times:
-            since = self._times[-1][1] - 0.98 * self.config.pattern.period
+            since = self._times[-1][1] - 0.9 * self.config.pattern.period
             self._extend([track for track in self.tracks if track.last <= since])
         seen = [(track, spot) for track in self.tracks if (spot := self.spot(track)) is not None]
         lamps = [
