@@ -254,6 +254,17 @@ def test_the_command_finds_the_corners_and_writes_the_lens_alone(pictures, tmp_p
     assert cv2.imread(str(png)).shape[1] > 1000
 
 
+def test_a_picture_without_the_board_is_left_out_and_told(pictures, tmp_path, capsys):
+    paths, board = pictures
+    blank, file = tmp_path / "blank.png", tmp_path / "calibration.toml"
+    assert cv2.imwrite(str(blank), np.full((480, 640), 90, np.uint8))
+    asked = [*paths, str(blank), *board, "--model", "brown-conrady", "--camera", "front", "--calibration", str(file)]
+    assert main(["calibrate", "camera", *asked]) == 0
+    said = capsys.readouterr().err
+    assert "blank.png: the board is not seen; it is left out" in said
+    assert "10 pictures" in said
+
+
 def test_every_useless_picture_is_named_at_once(tmp_path, capsys):
     blank, small, text = (str(tmp_path / name) for name in ("blank.png", "small.png", "text.png"))
     assert cv2.imwrite(blank, np.full((480, 640), 90, np.uint8))

@@ -24,7 +24,9 @@ LEAST_VIEWS = 8  # different pictures: Zhang (PAMI 22(11), 2000) needs 3, and he
 LEAST_MOVE = 0.01  # of the picture's width, by which corners must differ between different pictures
 LEAST_TURN = math.radians(20.0)  # between the boards' planes
 LEAST_DEPTH = 1.3  # ratio of the farthest board to the nearest
-BORDER = 0.15  # of the picture's side: corners must come as near to each border
+BORDER = (
+    0.25  # of the picture's side: corners must come as near to each border; what lies beyond them `_reach` leaves out
+)
 MOST_RMS = 1.0  # px
 MOST_SIGMA_FOCAL = 0.01  # of the focal length
 MOST_SIGMA_PIXEL = 0.5  # px, up to which the lens is called valid
@@ -169,7 +171,7 @@ def _border(views: Sequence[View], size: tuple[int, int]) -> list[str]:
     wide = {side: gap for side, gap in gaps.items() if gap > BORDER}
     if not wide:
         return []
-    where = ", ".join(f"{side} ({100.0 * gap:.0f} %)" for side, gap in wide.items())
+    where = ", ".join(f"{side} ({math.ceil(100.0 * gap)} %)" for side, gap in wide.items())
     return [
         f"no corner lies near the {where} border, where the lens bends most; hold the board there, to within"
         f" {100.0 * BORDER:.0f} % of the picture"
