@@ -126,6 +126,24 @@ def test_sightings_that_fit_nothing_place_nothing():
     assert not any(label.status == "placed" for label in result.labels)
 
 
+def test_moves_in_feet_are_named_and_nothing_is_placed():
+    survey, _ = simulate(load("warehouse"), 3, World(slip=0.0))
+    feet = 1.0 / 0.3048
+    stops = [
+        replace(s, move=s.move and replace(s.move, dx=feet * s.move.dx, dy=feet * s.move.dy)) for s in survey.stops
+    ]
+    result = solve(replace(survey, stops=tuple(stops)))
+    assert any("the moves read as feet" in note for note in result.notes)
+    assert not any(label.status == "placed" for label in result.labels)
+
+
+def test_pictures_that_stand_on_their_head_put_labels_below_the_floor():
+    survey, _ = simulate(load("warehouse"), 3, World(slip=0.0))
+    result = solve(with_sightings(survey, lambda stop: [replace(s, v=479.0 - s.v) for s in stop.sightings]))
+    assert any("come out below the floor" in note for note in result.notes)
+    assert not any(label.status == "placed" for label in result.labels)
+
+
 def test_two_labels_with_exchanged_ids_at_some_stops_are_in_conflict():
     survey, _ = quiet_room()
     names = {"S04": "S05", "S05": "S04"}

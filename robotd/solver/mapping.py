@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -30,6 +29,7 @@ from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
 from .initial import world_rays
 from .linear import solve_linear
+from .misfit import FITS, FITS_NOT, Misfit, is_below_floor, misfit, strained
 from .problem import Bools, Problem, Sightings, State, build_problem, stops_per_label
 from .robust import Optimum, optimise
 from .ties import Rival, side_of
@@ -38,11 +38,6 @@ from .weights import OUTLIER
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
 _TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
 _TRUSTED_STOPS = 4  # agreement from as many is no chance, however many other sightings disagree
-_FITS = 0.5  # share of the survey's sightings below which its calibration or its units are doubted
-_FITS_NOT = 0.45  # and below which nothing is placed
-_LEAST_LIGHTS = 20  # to say so
-_CLEARLY_BETTER = 0.25  # of that share, to blame two cameras
-_MOST_TO_TRY = 5000  # sightings
 _OUTSIDE_M = 0.5  # a position so far outside all others may be an image in a shop window or a glossy shelf
 _SAME_PLACE_M = 0.05
 _SURPRISE = 21.1  # chi square of 3 degrees of freedom that chance exceeds once in 10 000
@@ -96,8 +91,8 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
     linear = everything.residuals(state, SQUARE)
     counts = Counter(problem.columns.names)
     tally = _tally(asked, optimum)
-    share = _share(optimum)
-    labels = tuple(_label(asked, optimum, tally, i, counts[label], share) for i, label in enumerate(problem.labels))
+    doubt = misfit(asked, optimum)
+    labels = tuple(_label(asked, optimum, tally, i, counts[label], doubt) for i, label in enumerate(problem.labels))
     located = np.array([m.status in ("placed", "known") for m in labels], dtype=np.bool_)
     residual_px = linear.residual * problem.sightings.sigma[:, None]
     inlier = optimum.inlier
@@ -109,8 +104,9 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
             f"leg/stop {', '.join(lost)} share too few labels with the rest to be joined to it; their poses are in "
             "their own odometry frame; map some of the same labels from both"
         )
-    if share < _FITS:
-        notes.append(_misfit(asked, share))
+    if doubt.text is not None:
+        notes.append(doubt.text)
+    notes += strained(optimum)
     if optimum.rival is not None and tally.elsewhere.any():
         notes.append(_two_ways(problem, optimum.rival, tally.elsewhere, state))
     if len(problem.sightings) == 0:
@@ -191,42 +187,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
     )
 
 
-def _share(optimum: Optimum) -> float:
-    """Share of the lights that the map explains, among those of labels that two stops or more saw.
-
-    Of rival sightings one is right; what lies in glass or floor is explained too. Too few sightings say nothing.
-    """
-    problem, s = optimum.problem, optimum.problem.sightings
-    seen = stops_per_label(s.label, s.stop, len(problem.labels))[s.label] >= 2
-    lights = np.bincount(s.rival[seen]) > 0
-    if np.count_nonzero(lights) < _LEAST_LIGHTS:
-        return 1.0
-    fits = np.bincount(s.rival[seen & (optimum.inlier | optimum.reflected)], minlength=len(lights)) > 0
-    return float(np.count_nonzero(fits) / np.count_nonzero(lights))
-
-
-def _misfit(asked: Problem, share: float) -> str:
-    """What to say of a survey most of whose sightings do not fit; looks whether two cameras were mistaken."""
-    text = f"only {100 * share:.0f} % of the sightings fit any map, so few labels are placed"
-    names = [camera.name for camera in asked.cameras]
-    best, swap = share + _CLEARLY_BETTER, None
-    if len(asked.sightings) <= _MOST_TO_TRY:
-        for pair in combinations(names, 2):
-            renamed = {pair[0]: pair[1], pair[1]: pair[0]}
-            cameras = tuple(replace(c, name=renamed.get(c.name, c.name)) for c in asked.survey.rig.cameras)
-            tried = replace(asked.survey, rig=replace(asked.survey.rig, cameras=cameras))
-            found = _share(optimise(build_problem(tried)))
-            if found > best:
-                best, swap = found, pair
-    if swap is not None:
-        return (
-            f"{text}; with cameras {swap[0]} and {swap[1]} exchanged {100 * best:.0f} % do: check rig.cameras and the "
-            "robot's cables"
-        )
-    return f"{text}; check the rig (which camera is which, metres, radians), the labels' ids and the moves' units"
-
-
-def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, share: float) -> MappedLabel:
+def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, doubt: Misfit) -> MappedLabel:
     problem, label = optimum.problem, asked.labels[i]
     inliers = tally.inliers[i]
     position, covariance = tally.position[i], tally.covariance[row] if (row := tally.row[i]) >= 0 else None
@@ -255,8 +216,16 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
         )
     if tally.agreeing_stops[i] < _TRUSTED_STOPS and tally.doubting[i] >= tally.agreeing[i]:
         return unplaced(f"only {inliers} of its {count} sightings agree, which may be chance; flash it again, alone")
-    if share < _FITS and (share < _FITS_NOT or tally.agreeing_stops[i] < _TRUSTED_STOPS):
-        return unplaced(f"only {100 * share:.0f} % of the survey's sightings fit together; see the map's notes")
+    if doubt.refused or (doubt.share < FITS and (doubt.share < FITS_NOT or tally.agreeing_stops[i] < _TRUSTED_STOPS)):
+        return unplaced(
+            "the survey as a whole is doubtful; see the map's notes"
+            if doubt.share >= FITS
+            else f"only {100 * doubt.share:.0f} % of the survey's sightings fit together; see the map's notes"
+        )
+    if is_below_floor(position[2], covariance[2][2]):
+        return unplaced(
+            f"its sightings meet below the floor ({position[2]:.2f} m), where no label hangs; was it seen in a mirror?"
+        )
     sigma = tally.sigma[i]
     if not sigma <= WIDEST_SIGMA_M:
         return unplaced(f"views nearly parallel (standard deviation {sigma:.2g} m); map it from a stop further aside")
