@@ -353,6 +353,39 @@ def test_a_light_that_clips_the_sensor_says_so_and_keeps_its_place():
     assert np.hypot(found[0][0].u - 60.4, found[0][0].v - 50.3) < 0.3
 
 
+@pytest.mark.parametrize("hertz", [1.0, 2.5, 3.3])
+def test_steady_blinking_at_any_rate_is_no_label_whenever_one_looks(hertz):
+    blinkers = grid_of_lights(np.full(20, 60.0), seed=4)
+    for light in blinkers:
+        light.share = lambda t, light=light: float(((t - light.start) * hertz) % 1.0 < 0.32)
+    detector, seen = FlashDetector(), []
+    for frame, t in zip(*shoot(blinkers, 4.0, seed=4), strict=True):
+        if detector.update(frame, float(t)):
+            seen += detector.flashes()
+    assert seen == []
+
+
+def test_a_light_twelve_pixels_wide_is_found_once():
+    label = Light(80.3, 60.4, 40.0, start=-0.4, width=3.4)
+    flashes = FlashDetector().detect(*shoot([label], 3.0))
+    assert len(flashes) == 1
+    assert np.hypot(flashes[0].u - label.u, flashes[0].v - label.v) < 0.15
+
+
+def test_a_step_of_the_exposure_loses_no_light_that_was_found():
+    labels = grid_of_lights(np.full(12, 14.0), seed=8)
+    frames, times = shoot(labels, 4.0, seed=8, texture=30.0)
+    brighter = [
+        frame if t < 2.2 else np.clip(1.1 * frame, 0, 255).astype(np.uint8)
+        for frame, t in zip(frames, times, strict=True)
+    ]
+    before, after = FlashDetector().detect(frames[:66], times[:66]), FlashDetector().detect(brighter, times)
+    found = [bool(flashes) for flashes in matches(before, labels)[0]]
+    kept = [bool(flashes) for flashes in matches(after, labels)[0]]
+    assert sum(found) >= 9
+    assert all(late for early, late in zip(found, kept, strict=True) if early)
+
+
 def test_a_detector_keeps_within_nine_megabytes():
     rng = np.random.default_rng(0)
     frames = rng.integers(60, 120, (4, 480, 640), dtype=np.uint8)
