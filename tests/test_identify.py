@@ -246,6 +246,18 @@ def test_the_first_question_asks_everybody_and_later_ones_only_those_in_doubt():
     assert inquiry.next_question(sure, 40.0) is None
 
 
+def test_a_light_that_is_probably_a_reflection_of_a_named_one_is_not_worth_a_slot():
+    for odds, worth in ((0.8, False), (0.5, True)):
+        inquiry = inquire(29)
+        inquiry.next_question(None, 0.0)
+        answer(inquiry, 0.0, lights=3)
+        named = [(np.array([label]), np.array([0.9999])) for label in (3, 5)]
+        third = (np.array([3, 17]), np.array([odds, 1.0 - odds]))
+        probability = np.array([0.9999, 0.9999, odds])
+        posterior = Posterior(np.array([3, 5, 3]), probability, np.zeros(3), [*named, third])
+        assert (inquiry.next_question(posterior, 20.0) is not None) == worth
+
+
 def test_labels_on_a_common_list_get_different_answers():
     inquiry = inquire(200)
     inquiry.next_question(None, 0.0)

@@ -33,6 +33,7 @@ SILENCE = 4.0  # and no longer than until so many usual pauses between two flash
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
 SINGLES = 3  # slots for each label when they are asked one at a time
 ENOUGH_OWED = 0.4  # of the known labels: when the audit owes so many, it gets a slot of its own
+REFLECTED = 0.3  # probability of labels without a light here, below which a light is a reflection not worth a slot
 STILL_THERE = 0.1  # probability from which a label that did not answer is asked again
 
 
@@ -188,8 +189,12 @@ class Inquiry:
             posterior.open(config.min_probability) & (self._found(len(posterior.label)) > number)
         )
         named = np.flatnonzero(posterior.decided(config.min_probability) & (posterior.none < 0.5))
-        worth = len(undecided) >= max(1.0, config.repeat_fraction * (len(named) + len(undecided)))
-        worth |= any(self._is_new(*posterior.candidates[light]) for light in undecided)
+        seen = np.zeros(len(candidates.weights), bool)
+        seen[posterior.label[named]] = True
+        unseen = [_share(posterior.candidates[light], ~seen) for light in undecided]
+        missing = np.count_nonzero(np.array(unseen) > REFLECTED)
+        worth = missing >= max(1.0, config.repeat_fraction * (len(named) + len(undecided)))
+        worth |= any(_share(posterior.candidates[light], ~seen & ~candidates.known) > 0.5 for light in undecided)
         audit = silent = np.zeros(0, np.intp)
         if len(self.evidence) == 1:
             known = np.flatnonzero(candidates.expected & self.asked)
@@ -213,10 +218,6 @@ class Inquiry:
             return None
         doubt = (1.0 - posterior.probability[undecided]) / np.maximum(posterior.probability[undecided], 1e-9)
         return self._compose(ask, ask[:0], lists, float(np.median(doubt)) if len(doubt) else 0.0)
-
-    def _is_new(self, labels: Numbers, odds: Floats) -> bool:
-        """Whether a light with these candidates is probably a label that was never seen: perhaps nowhere else."""
-        return float(odds[~self.candidates.known[labels]].sum()) > 0.5
 
     def _still_there(self, silent: Numbers) -> Numbers:
         """Those of the labels without an answer that are in view rather than hidden, though their flashes were lost."""
@@ -365,6 +366,12 @@ class Inquiry:
         """Whether a queue took so long that the throughput shows."""
         number = max((len(slot.labels) for slot in self.evidence), default=0)
         return number * self.delays.interval > 4.0 * self.delays.median * self.delays.sigma
+
+
+def _share(candidates: tuple[Numbers, Floats], labels: Flags) -> float:
+    """Probability of these labels (L,) among a light's candidates."""
+    names, odds = candidates
+    return float(odds[labels[names]].sum())
 
 
 def releases(times: Floats, delays: DelayModel) -> Floats:
