@@ -29,7 +29,7 @@ def draw_plan(path: Path, study: Study) -> None:
     """
     figure = new_figure(path, 12.5, 6.25, 160.0)
     figure.text(0.05, 0.94, f"Next stops of {plain(study.plan.survey[:40])}", size=14, weight="bold", color=INK)
-    left, right = figure.add_axes((0.05, 0.08, 0.42, 0.78)), figure.add_axes((0.55, 0.08, 0.42, 0.78))
+    left, right = figure.add_axes((0.05, 0.08, 0.42, 0.78)), figure.add_axes((0.535, 0.08, 0.42, 0.78))
     stops = np.array([[stop.x, stop.y] for stop in study.map.stops]).reshape(-1, 2)
     there = np.isfinite(study.positions[:, 0])
     labels = study.positions[there]
