@@ -18,13 +18,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from .oi_packets import GROUPS as GROUPS
-from .oi_packets import PACKETS as PACKETS
-from .oi_packets import Packet as Packet
-from .oi_packets import decode_values as decode_values
-from .oi_packets import encode_values as encode_values
-from .oi_packets import members as members
-from .oi_packets import packet_struct
+from .oi_packets import (
+    GROUPS as GROUPS,
+    PACKETS as PACKETS,
+    Packet as Packet,
+    decode_values as decode_values,
+    encode_values as encode_values,
+    members as members,
+    packet_struct,
+)
 
 HEADER = 19
 TICK = 0.015  # s between two updates of the robot's sensor values

@@ -25,8 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from . import jpeg, v4l2_controls
-from . import v4l2_api as api
+from . import jpeg, v4l2_api as api, v4l2_controls
 from .camera_feed import FrameQueue
 from .clock import in_thread
 from .errors import DriverFault

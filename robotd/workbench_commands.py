@@ -17,8 +17,7 @@ import numpy as np
 from .errors import InputError
 from .files import write_atomic
 from .footage import Shot
-from .recording import read_contents
-from .recording import recover as make_whole
+from .recording import read_contents, recover as make_whole
 from .records import Flash
 from .toml_edit import toml
 from .workbench import pictures
@@ -29,8 +28,7 @@ from .workbench.score import Score
 from .workbench.sequence import Tagged, appearances, judge_clips, measure, open_all, open_tagged, steps
 from .workbench.tags import NEAR_PX, Tag, add_tag, load_tags, remove_tags, save_tags, tags_path
 from .workbench.trace import Trace
-from .workbench.tune import Trial, parse_range, score_set, shared
-from .workbench.tune import tune as search
+from .workbench.tune import Trial, parse_range, score_set, shared, tune as search
 
 QUANTILES = (5, 25, 50, 75, 95)
 _LATE_S = 1.0  # after the last frame, that may still be asked for

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from robotd.drivers.gpio_beacons import BeaconConfig, BeaconDriver
 
 from robotd.beacons import SEPARATION, BeaconRates, conflicts, good_pairs, rates, seen

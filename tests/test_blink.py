@@ -3,8 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from robotd.vision import blink_reference as reference
 from robotd.vision.blink import FlashConfig, FlashDetector, FlashPattern, kernels

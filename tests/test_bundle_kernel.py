@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from robotd.geometry.camera import Camera
 from robotd.geometry.transforms import invert_rigid, pose_matrix, rotation_vector, se2_relative, transform_points

@@ -13,8 +13,7 @@ from robotd.files import save_survey
 from robotd.geometry.homography import apply
 from robotd.geometry.transforms import rotation_matrix, rotation_vector
 from robotd.odometry import Wheels
-from robotd.roof.setup import RoofCalibration, load_calibrations
-from robotd.roof.setup import save_calibration as save_roof
+from robotd.roof.setup import RoofCalibration, load_calibrations, save_calibration as save_roof
 from robotd.solver.calibrate_rig import Bounds, calibrate_rig, camera_to_camera, merge, sphere
 from robotd.solver.rig_report import report
 from robotd.solver_main import main

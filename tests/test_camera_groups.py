@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from robotd.drivers.v4l2 import V4l2Config, V4l2Driver
 
-from robotd import observation as observation_module
-from robotd import v4l2
-from robotd import v4l2_api as api
+from robotd import observation as observation_module, v4l2, v4l2_api as api
 from robotd.bind import bind
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual, ticks

@@ -10,8 +10,7 @@ import stat
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from robotd import rpc
 from robotd.clock import now, run_virtual

@@ -5,8 +5,7 @@ import os
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from robotd.errors import InputError
 from robotd.files import (

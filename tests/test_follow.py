@@ -6,8 +6,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robotd.drivers.line_follower import LineFollowerConfig, LineFollowerDriver
 
 from robotd.bus import Bus

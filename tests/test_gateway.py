@@ -13,8 +13,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import robotd.gateway as gateway
 from robotd.clock import run_virtual

@@ -13,11 +13,9 @@ import threading
 import tty
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from robotd import guardian as guardian_module
-from robotd import oi
+from robotd import guardian as guardian_module, oi
 from robotd.guardian import Guardian, _listen, main
 from robotd.serial_port import HALT, MAX_HALTS, set_rate
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from robotd.geometry.homography import Homography, apply, cross_error, direct, fit, jacobians, rescaled
 

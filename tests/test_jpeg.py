@@ -5,8 +5,7 @@ import asyncio
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from robotd.camera_feed import CameraMeter, FrameQueue
 from robotd.errors import DriverFault

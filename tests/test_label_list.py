@@ -5,8 +5,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from robotd.drivers.pricer import PricerConfig, PricerDriver
 
 from robotd.bus import Bus

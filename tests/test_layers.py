@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 LAYERS = {
-    0: ["errors", "records"],
+    0: ["errors", "records", "survey_records"],
     1: [
         "beacons",
         "bind",

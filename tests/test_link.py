@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from robotd import link as link_module
-from robotd import real as real_module
+from robotd import link as link_module, real as real_module
 from robotd.clock import run_virtual
 from robotd.errors import DriverFault
 from robotd.link import LentLink

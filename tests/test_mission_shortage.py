@@ -5,8 +5,7 @@ import shutil
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from robotd.errors import InputError, StorageError
 from robotd.mission_guards import BatteryGuard, DiskGuard

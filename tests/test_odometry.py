@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robotd.drivers.roomba import RoombaConfig, RoombaDriver
 
 from robotd.bind import bind

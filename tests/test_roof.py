@@ -5,8 +5,7 @@ from datetime import UTC, datetime
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from robotd.errors import ConfigError
 from robotd.files import stop_to_json, survey_from_json, survey_to_json

@@ -23,8 +23,7 @@ from urllib.parse import quote
 
 import pytest
 import uvicorn
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from robotd.config import Config, UploadConfig
 from robotd.doctor import check_server

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from robotd.errors import ConfigError
 from robotd.sim.line import LineGeometry, distance_to_box, distance_to_segment

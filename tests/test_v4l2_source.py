@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from robotd.drivers.v4l2 import V4l2Config, V4l2Driver
 
-from robotd import v4l2
-from robotd import v4l2_api as api
+from robotd import v4l2, v4l2_api as api
 from robotd.bus import Bus
 from robotd.config import Calibration
 from robotd.errors import DriverFault

@@ -6,8 +6,7 @@ import os
 import subprocess
 import sys
 
-from .client import dial_stdio as join
-from .client import ssh_command
+from .client import dial_stdio as join, ssh_command
 from .errors import NO_CONNECTION, CtlError
 
 TYPE_CHECKING = False

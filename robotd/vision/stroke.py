@@ -22,17 +22,13 @@ from numpy.typing import NDArray
 
 from ..records import Floats, Line
 from . import join_reference, measure_reference, polyline_reference, stroke_reference
-from .cluster import dbscan
-from .cluster import kernels as clustering
+from .cluster import dbscan, kernels as clustering
 from .evidence import SUPPORTED, believed, confidence, without_doubles
 from .polyline import SHARP, sharpened
 from .thesis_line import detect_thesis
 
 try:
-    from . import _join as joining
-    from . import _measure as measuring
-    from . import _polyline as tracing
-    from . import _stroke as kernels
+    from . import _join as joining, _measure as measuring, _polyline as tracing, _stroke as kernels
 except ImportError:  # built with ROBOTD_NO_EXTENSIONS=1
     kernels = stroke_reference  # type: ignore[misc]
     joining = join_reference  # type: ignore[misc]
