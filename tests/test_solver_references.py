@@ -19,8 +19,8 @@ from robotd.records import (
     RoofCamera,
 )
 from robotd.solver import evaluate, solve
-from robotd.solver.bundle import Adjustment, Loss, travelled
-from robotd.solver.problem import State, build_problem
+from robotd.solver.bundle import Adjustment, Loss
+from robotd.solver.problem import State, build_problem, travelled
 from robotd.solver.robust import optimise
 from tests.store_surveys import (
     World,

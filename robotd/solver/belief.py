@@ -17,9 +17,9 @@ import scipy.sparse
 
 from ..geometry.transforms import heading_matrix, invert_rigid, pose_matrix, se2_relative, transform_points
 from ..records import Floats
-from .bundle import SQUARE, Adjustment, travelled
+from .bundle import SQUARE, Adjustment
 from .covariance import inverse
-from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Known, Moves, Problem, Sightings, State
+from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Known, Moves, Problem, Sightings, State, travelled
 from .robust import Optimum
 
 _POSE_SIGMA = 10.0  # metres and radians: where a stop would be, before anything there is measured

@@ -19,7 +19,7 @@ import scipy.sparse
 from ..geometry.transforms import heading_matrix, pose_matrix, rotation_matrix, skew, wrap_angle
 from ..records import Floats
 from .kernel import SHAPES, compiled
-from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Bools, Ints, Problem, Sightings, State
+from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Bools, Ints, Problem, Sightings, State, travelled
 
 if TYPE_CHECKING:
     from ._bundle import Bundle
@@ -484,12 +484,6 @@ class Adjustment:
         frame[self.problem.free] += frame_step
         points[self.labels] += point_step
         return replace(state, frame=frame, points=points)
-
-
-def travelled(moves: Floats) -> Floats:
-    """(M,) metres of way that moves (M, 3) took, if it was an arc."""
-    half = 0.5 * moves[:, 2]
-    return np.asarray(np.hypot(moves[:, 0], moves[:, 1]) / np.sinc(half / np.pi))
 
 
 def _cauchy(square: Floats, width: float) -> tuple[Floats, Floats]:

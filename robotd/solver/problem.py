@@ -488,3 +488,8 @@ def _prior_sigma(survey: Survey, roofs: Roofs, axes: Floats, fixed_first: bool) 
     beacons = np.repeat(np.where(seen, p.beacon_m, 0.0), BEACON)
     odometry = [p.odometry_scale, p.odometry_turn, p.odometry_drift]
     return np.concatenate([stops.ravel(), cameras, plane.ravel(), beacons, odometry])
+
+
+def travelled(moves: Floats) -> Floats:
+    """(M,) metres of way that moves (M, 3) took, if it was an arc."""
+    return np.asarray(np.hypot(moves[:, 0], moves[:, 1]) / np.sinc(0.5 * moves[:, 2] / np.pi))
