@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from robotd.vision import _cluster, cluster_reference
+from robotd.vision import cluster_reference
 from robotd.vision.cluster import dbscan
+
+_cluster = pytest.importorskip("robotd.vision._cluster", reason="built without extensions")
 
 
 def points(count, seed, *, columns=5, spread=12.0):
