@@ -150,7 +150,7 @@ def test_where_a_bus_carries_two_the_third_names_the_mend_and_pairs_take_turns_w
     async def main():
         hardware = RealHardware()
         pair = await open_all(hardware, NAMES[:2], CameraMode())
-        with pytest.raises(DriverFault, match=r"no room.* look in turns .camera_groups in .mission.."):
+        with pytest.raises(DriverFault, match=r"no room.* look in pairs .camera_groups in .mission.."):
             await open_all(hardware, NAMES[2:3], CameraMode())
         for group in (NAMES[2:], NAMES[:2], NAMES[2:]):
             for source in pair:

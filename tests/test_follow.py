@@ -12,7 +12,7 @@ from robotd.drivers.line_follower import LineFollowerConfig, LineFollowerDriver
 from robotd.bus import Bus
 from robotd.clock import now, run_virtual
 from robotd.config import Calibration
-from robotd.errors import ConfigError, MissionError
+from robotd.errors import ConfigError, DriverFault, MissionError
 from robotd.follow import PathFollower
 from robotd.geometry.camera import Camera
 from robotd.odometry import Odometry, Wheels
@@ -358,8 +358,12 @@ def test_a_cancelled_follow_commands_zero():
     run_virtual(main())
 
 
-def test_without_a_calibrated_floor_camera_the_configuration_is_refused():
-    with pytest.raises(ConfigError, match="floor_camera"):
-        LineFollowerDriver("line", LineFollowerConfig(), None, Bus(), Calibration())
+def test_without_a_calibrated_floor_camera_the_follower_is_in_fault_so_that_it_can_be_calibrated():
+    driver = LineFollowerDriver("line", LineFollowerConfig(), None, Bus(), Calibration())
+    with pytest.raises(DriverFault, match="floor_camera"):
+        asyncio.run(driver.open())
+
+
+def test_a_view_without_floor_is_refused():
     with pytest.raises(ConfigError, match="sees no floor"):
         LineFollowerDriver("line", LineFollowerConfig(view_near=9.0, view_far=9.5), None, Bus(), CALIBRATION)
