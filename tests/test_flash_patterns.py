@@ -134,6 +134,19 @@ def test_two_lights_that_flash_differently_are_named_and_one_can_be_chosen():
     assert len(learn_pattern(film, times, near=(91.0, 61.0)).pattern.on) == 2
 
 
+def test_a_screen_that_flickers_leaves_room_for_a_dim_label():
+    rng = np.random.default_rng(5)
+    times = np.arange(180) / 30.0
+    film = np.full((180, 144, 192), 90, np.uint8)
+    film[:, 10:70, 20:150] = rng.integers(60, 200, 180)[:, None, None]  # of 300 places in it each varies more
+    share = FlashPattern().coverage((times - 0.31) % 1.0, 0.01, 2)
+    film[:, 120:122, 100:102] += (50.0 * share).astype(np.uint8)[:, None, None]
+    noisy = np.clip(film + rng.normal(0.0, 2.0, film.shape), 0, 255).astype(np.uint8)
+    learnt = learn_pattern(noisy, times)
+    assert (learnt.u, learnt.v) == pytest.approx((100.5, 120.5), abs=2.0)
+    assert len(learnt.pattern.on) == 3
+
+
 def test_nothing_is_learnt_where_nothing_repeats():
     rng = np.random.default_rng(0)
     noise = rng.normal(90.0, 3.0, (120, 48, 64)).astype(np.uint8)

@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 
 _PLACES = 24  # that vary most, examined
 _APART = 3  # cells
+_AS_MUCH = 0.5  # of a place's change above what is usual: what is joined to it by so much belongs to it, as in a screen
 _LEAST_CYCLES = 3
 _LEAST_CONTRAST = 4.0  # of a flash over the noise of one frame
 _NO_WORSE = 1.3  # a shorter period's fold may leave so much more than the best one's
@@ -172,7 +173,10 @@ def _same(a: LearntPattern, b: LearntPattern) -> bool:
 def _curves(
     cells: NDArray[Any], light: NDArray[np.float32], near: tuple[float, float] | None
 ) -> list[tuple[int, int, Floats]]:
-    """Row, column and light curve, less the cells around, of the 2x2-cell places that vary most."""
+    """Row, column and light curve, less the cells around, of the 2x2-cell places that vary most.
+
+    A screen or a window that changes as a whole is one place: its cells would leave no room for a label's.
+    """
     change = np.zeros(cells.shape[1:], np.float32)
     means = cells.mean(axis=(1, 2))
     for k in range(1, len(cells)):  # less the flicker of the lamps
@@ -183,12 +187,15 @@ def _curves(
         rows, columns = np.mgrid[: sums.shape[0], : sums.shape[1]]
         sums[np.hypot(2.0 * columns + 1.5 - near[0], 2.0 * rows + 1.5 - near[1]) > 12.0] = 0.0
     curves = []
+    usual = float(np.median(sums))
     for _ in range(_PLACES):
         row, column = divmod(int(np.argmax(sums)), sums.shape[1])
         if sums[row, column] <= 0.0:
             break
+        region = (sums >= usual + _AS_MUCH * (sums[row, column] - usual)).astype(np.uint8)
+        cv2.floodFill(region, None, (column, row), 2)
+        sums[cv2.dilate((region == 2).astype(np.uint8), np.ones((2 * _APART + 1, 2 * _APART + 1), np.uint8)) > 0] = 0.0
         top, left = max(row - _APART, 0), max(column - _APART, 0)
-        sums[top : row + _APART + 1, left : column + _APART + 1] = 0.0
         around = light[cells[:, top : row + _APART + 2, left : column + _APART + 2]]
         place = light[cells[:, row : row + 2, column : column + 2]].mean(axis=(1, 2))
         around = np.median(around, axis=(1, 2))
