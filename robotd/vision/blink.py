@@ -77,7 +77,7 @@ class FlashConfig:
     max_sigma_px: float = ranged(0.2, minimum=0.01, doc="nor is its position less certain")
     steady_hz: tuple[float, float] = (0.6, 10.0)  # limits of the rates of other things that blink
     max_candidates: int = ranged(72, minimum=1, maximum=2000, doc="apertures examined at one decision")
-    max_reflection: float = ranged(0.9, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
+    max_reflection: float = ranged(0.85, minimum=0.0, maximum=1.0, doc="likelier reflections are not reported")
 
     def min_score(self, shape: tuple[int, int]) -> float:
         """Log-likelihood ratio from which a light is accepted in images of this shape (H, W)."""
