@@ -329,13 +329,6 @@ def test_a_stop_too_short_for_names_asks_a_few_labels_all_the_same():
     assert 1 <= len(inquire(50, IdentifyConfig(stop_s=10.0)).next_question(None, 0.0).labels) < 50
 
 
-def test_labels_that_hardly_show_are_asked_along_with_known_ones():
-    weights = np.where(np.arange(29) < 19, 0.9, 0.003)
-    known = np.ones(29, bool)
-    question = inquire(29, weights=weights, expected=np.arange(29) < 19, known=known).next_question(None, 0.0)
-    assert sorted(question.labels) == list(range(29))  # a second's worth of commands
-
-
 def test_one_at_a_time_asks_one_label_a_slot():
     inquiry = inquire(3, IdentifyConfig(scheme="one at a time"))
     for label in range(3):

@@ -32,7 +32,6 @@ SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput 
 SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
 SINGLES = 3  # slots for each label when they are asked one at a time
-FEW_LIGHTS = 3.0  # that a stop may name; where it has no time for more, it asks what it can
 ENOUGH_OWED = 0.4  # of the known labels: when the audit owes so many, it gets a slot of its own
 REFLECTED = 0.3  # probability of labels without a light here, below which a light is a reflection not worth a slot
 STILL_THERE = 0.1  # probability from which a label that did not answer is asked again
@@ -169,13 +168,10 @@ class Inquiry:
         known = self._rng.permutation(np.flatnonzero(candidates.wanted & candidates.expected))
         others = self._rng.permutation(np.flatnonzero(self._worth_asking() & ~candidates.expected))
         others = others[np.argsort(candidates.asked[others], kind="stable")]
-        hardly = others[candidates.known[others]]  # they seldom show, and are few
-        others = others[~candidates.known[others]]
-        most = self.pace.affordable(len(known) + len(hardly), candidates.weights[others], config.stop_s)
-        few = float(candidates.weights[others[:most]].sum()) < FEW_LIGHTS
-        if few and not len(known):  # too short a time for names; what can be asked at all may be named later
-            most = max(most, 1, int(0.5 * (config.stop_s - self.pace.overhead) / self.delays.interval))
-        others = np.concatenate([hardly, others[:most]])
+        most = self.pace.affordable(len(known), candidates.weights[others], config.stop_s)
+        if not most and not len(known):  # too short a time for names; what can be asked at all may be named later
+            most = max(1, int(0.5 * (config.stop_s - self.pace.overhead) / self.delays.interval))
+        others = others[:most]
         if not len(known) + len(others):
             return None
         groups = [candidates.rivals.get(int(label), label[None]) for label in known]
