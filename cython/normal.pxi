@@ -309,7 +309,7 @@ cdef class Normals(Structure):
 
     cdef void _moves(self, const double* frame, const Shape* loss, Normal* n) noexcept nogil:
         cdef int m, i, j, k, a, b, wa, wb, r
-        cdef double c, s, dx, dy, weight, square, scale, turn, drift, factor, way
+        cdef double c, s, dx, dy, weight, square, scale, turn, drift
         cdef const double* z
         cdef const double* L
         cdef const double* x
@@ -325,8 +325,7 @@ cdef class Normals(Structure):
         scale, turn, drift = frame[self.odometry_entry], frame[self.odometry_entry + 1], frame[self.odometry_entry + 2]
         for m in range(self.moves):
             a, b = self.before[m], self.after[m]
-            z, L = self.moved + 14 * m, self.moved + 14 * m + 3
-            factor, way = L[9], L[10]
+            z, L = self.moved + 21 * m, self.moved + 21 * m + 3
             x, y = frame + STOP * a, frame + STOP * b
             c, s = cos(x[2]), sin(x[2])
             dx, dy = y[0] - x[0], y[1] - x[1]
@@ -338,11 +337,14 @@ cdef class Normals(Structure):
                 for j in range(3):
                     D[MOVE * i + j] = -D[MOVE * i + 3 + j]
             D[2], D[MOVE + 2] = e[1], -e[0]
-            D[6], D[MOVE + 6], D[2 * MOVE + 7] = -factor * z[0], -factor * z[1], -factor * z[2]
-            D[8], D[MOVE + 8], D[2 * MOVE + 8] = 0.5 * factor * way * z[1], -0.5 * factor * way * z[0], -factor * way
-            e[0] += D[6] * scale + D[8] * drift - z[0]
-            e[1] += D[MOVE + 6] * scale + D[MOVE + 8] * drift - z[1]
-            e[2] = _wrapped(y[2] - x[2] - z[2]) + D[2 * MOVE + 7] * turn + D[2 * MOVE + 8] * drift
+            for i in range(3):
+                for j in range(ODOMETRY):
+                    D[MOVE * i + 6 + j] = -L[9 + ODOMETRY * i + j]
+            e[0] -= z[0]
+            e[1] -= z[1]
+            e[2] = _wrapped(y[2] - x[2] - z[2])
+            for i in range(3):
+                e[i] += D[MOVE * i + 6] * scale + D[MOVE * i + 7] * turn + D[MOVE * i + 8] * drift
             square = 0.0
             for i in range(3):
                 whitened[i] = L[3 * i] * e[0] + L[3 * i + 1] * e[1] + L[3 * i + 2] * e[2]

@@ -58,7 +58,7 @@ cdef class Structure:
     cdef double* t_robot_camera
     cdef int* before
     cdef int* after
-    cdef double* moved  # 3 measured, 9 root of information, 1 if the odometry factors apply, else 0, metres of way
+    cdef double* moved  # 3 measured, 9 root of information, 9 derivatives by the odometry factors
     cdef int* roof_stop
     cdef int* roof_plane  # of each sighting, its roof camera, then, from `planes` on, its beacon
     cdef double* plane_axes  # of each roof camera, (8, 3, 3)
@@ -71,8 +71,8 @@ cdef class Structure:
         const double[:, :, ::1] R_robot_camera, const double[:, ::1] t_robot_camera, const int64_t[::1] stop,
         const int64_t[::1] camera, const int64_t[::1] point, const double[:, ::1] uv, const double[::1] sigma,
         const double[::1] probability, const int64_t[::1] before, const int64_t[::1] after,
-        const double[:, ::1] measured, const double[:, :, ::1] roots, const double[::1] by_wheels,
-        const double[::1] travelled, const int64_t[::1] roof_stop, const int64_t[::1] roof_camera,
+        const double[:, ::1] measured, const double[:, :, ::1] roots, const double[:, :, ::1] by_errors,
+        const int64_t[::1] roof_stop, const int64_t[::1] roof_camera,
         const int64_t[::1] roof_beacon, const double[:, :, :, ::1] roof_axes, int beacons,
         const double[:, ::1] beacon, const double[:, ::1] roof_uv, const double[::1] roof_sigma,
         const double[:, :, ::1] H_image_world, const int64_t[::1] known_point, const double[:, ::1] known_position,
@@ -130,16 +130,16 @@ cdef class Structure:
                 self.t_robot_camera[3 * c + k] = t_robot_camera[c, k]
         self.moves, self.roofs, self.knowns = before.shape[0], roof_stop.shape[0], known_point.shape[0]
         self.before, self.after = arena.ints(self.moves), arena.ints(self.moves)
-        self.moved = arena.doubles(14 * self.moves)
+        self.moved = arena.doubles(21 * self.moves)
         for i in range(self.moves):
             if not 0 <= before[i] < after[i] < stops:
                 raise ValueError(f"a move must lead from an earlier to a later stop, got {before[i]} to {after[i]}")
             self.before[i], self.after[i] = before[i], after[i]
             for k in range(3):
-                self.moved[14 * i + k] = measured[i, k]
+                self.moved[21 * i + k] = measured[i, k]
             for k in range(9):
-                self.moved[14 * i + 3 + k] = roots[i, k // 3, k % 3]
-            self.moved[14 * i + 12], self.moved[14 * i + 13] = by_wheels[i], travelled[i]
+                self.moved[21 * i + 3 + k] = roots[i, k // 3, k % 3]
+                self.moved[21 * i + 12 + k] = by_errors[i, k // 3, k % 3]
         self.roof_stop, self.roof = arena.ints(self.roofs), arena.doubles(15 * self.roofs)
         self.roof_plane, self.plane_axes = arena.ints(2 * self.roofs), arena.doubles(9 * ROOF * self.planes)
         for i in range(self.planes):

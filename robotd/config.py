@@ -11,7 +11,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,12 +19,14 @@ from .bind import bind, ranged
 from .errors import ConfigError, InputError
 from .files import write_atomic
 from .identify import IdentifyConfig
-from .odometry import Wheels
+from .odometry import Wheels, odometry_priors
 from .records import CameraModel, KnownLabel, Priors, Rig, Sigmas, Vector3
 from .safety import SafetyLimits
 from .toml_edit import assignments, replace_element, replace_table, toml
 
 T = TypeVar("T")
+
+FLOOR_TILT = math.radians(0.3)  # rad: slopes of shop floors under a robot, one sigma
 
 _FINGERPRINT = re.compile("[0-9a-f]{64}")  # of SHA-256
 
@@ -189,6 +191,24 @@ class Calibration:
     stamp_offsets: dict[str, float] = field(default_factory=dict)
     priors: Priors = field(default_factory=Priors)
     sigmas: Sigmas = field(default_factory=lambda: Sigmas(pixel_px=0.2))
+
+    @property
+    def survey_priors(self) -> Priors:
+        """The priors as surveys carry them: what [priors] leaves out is what wheels and floors leave.
+
+        A survey whose odometry were exact could not find its own size, and floors are not flat.
+        """
+        scale, turn, drift, correlation = odometry_priors(self.wheels)
+        given = self.priors
+        if not (given.odometry_scale or given.odometry_turn or given.odometry_drift):
+            given = replace(
+                given,
+                odometry_scale=scale,
+                odometry_turn=turn,
+                odometry_drift=drift,
+                odometry_correlation=correlation,
+            )
+        return given if given.tilt_rad else replace(given, tilt_rad=FLOOR_TILT)
 
     @property
     def rig(self) -> Rig:

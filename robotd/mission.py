@@ -151,7 +151,7 @@ class Mission(Steps):
             stops=(),
             created=self._utc(),
             sigmas=self.calibration.sigmas,
-            priors=self.calibration.priors,
+            priors=self.calibration.survey_priors,
             known_labels=config.known_labels,
         )
         self.leg = await in_thread(self.journal.begin_leg, self._header)

@@ -76,6 +76,21 @@ class Wheels:
             )
 
 
+def odometry_priors(wheels: Wheels) -> tuple[float, float, float, float]:
+    """Standard deviations of what is the same error in all moves, and the correlation of its first two.
+
+    Of scale (relative), turns (relative) and drift (radians per metre), as the covariance of `wheels` has them: a turn
+    is a difference of travels over the base, so that wheels larger than believed lengthen ways and turns alike.
+    """
+    half = 0.5 / (0.5 * (wheels.scale_left + wheels.scale_right))
+    A = np.array([[half, half, 0.0], [half, half, -1.0 / wheels.base], [-1.0 / wheels.base, 1.0 / wheels.base, 0.0]])
+    P = A @ np.array(wheels.covariance) @ A.T
+    scale, turn, drift = np.sqrt(np.maximum(np.diagonal(P), 0.0)).tolist()
+    drift = drift if drift > 1e-9 else 0.0  # of wheels that are alike only rounding is left
+    correlation = float(np.clip(P[0, 1] / (scale * turn), -1.0, 1.0)) if scale > 0.0 and turn > 0.0 else 0.0
+    return scale, turn, drift, correlation
+
+
 def arc(left: float, right: float, base: float) -> tuple[float, float, float]:
     """Displacement (dx, dy, dheading) in the axes at the start of wheels rolling `left` and `right` metres.
 
@@ -113,6 +128,10 @@ class _Path:
         self._calibration.add(step, along, left, right)
         self.at += step
         self.heading += turn
+
+    def by_errors(self) -> Matrix3:
+        """How it depends on the calibration; see `Move`."""
+        return self._calibration.by_errors()
 
     def covariance(self, *, total: bool) -> Matrix3:
         """With the encoders' quantisation at both ends, which also keeps it positive definite after no motion."""
@@ -207,7 +226,8 @@ class Odometry:
         the calibration's part is then the same error in every move. Either is positive definite.
         """
         move = self._move
-        return Move(move.at.real, move.at.imag, wrap_angle(move.heading), move.covariance(total=total))
+        covariance = move.covariance(total=total)
+        return Move(move.at.real, move.at.imag, wrap_angle(move.heading), covariance, move.by_errors())
 
     def pose_covariance(self) -> Matrix3:
         """Total covariance of the pose (x, y, heading) since construction; what resets hide is not in it."""

@@ -173,8 +173,22 @@ class CalibrationError:
 
     def second_moment(self) -> Matrix3:
         """J S J^T with S the calibration's covariance, in the axes of the path's start."""
-        J = np.array([[z.real for z in self._position], [z.imag for z in self._position], self._heading])
+        J = self._derivatives()
         return as_matrix3(J @ np.array(self._wheels.covariance) @ J.T)
+
+    def by_errors(self) -> Matrix3:
+        """Derivatives of x, y, heading by relative errors of scale and turns, and by drift, radians per metre.
+
+        Scale with the turns kept is both wheels' size and as much of the base; the turns alone are the base.
+        """
+        wheels = self._wheels
+        by_left, by_right, by_base = self._derivatives().T
+        by_scale = wheels.scale_left * by_left + wheels.scale_right * by_right + wheels.base * by_base
+        by_drift = 0.5 * wheels.base * (by_right - by_left)
+        return as_matrix3(np.column_stack([by_scale, -wheels.base * by_base, by_drift]))
+
+    def _derivatives(self) -> Floats:
+        return np.array([[z.real for z in self._position], [z.imag for z in self._position], self._heading])
 
 
 def as_matrix3(array: Floats) -> Matrix3:

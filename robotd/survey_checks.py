@@ -57,8 +57,10 @@ def check_header(parts: Mapping[str, Any], problems: Problems) -> None:
         _above_zero(sigmas.pixel_px, "sigmas.pixel_px", problems)
         _above_zero(sigmas.roof_px, "sigmas.roof_px", problems)
     if (priors := parts.get("priors")) is not None:
+        if abs(priors.odometry_correlation) > 1:
+            problems.add("priors.odometry_correlation", f"found {priors.odometry_correlation:g}; expected -1 to 1")
         for name in priors.__dataclass_fields__:
-            if getattr(priors, name) < 0:
+            if name != "odometry_correlation" and getattr(priors, name) < 0:
                 problems.add(f"priors.{name}", f"found {getattr(priors, name):g}; expected 0 (held fixed) or more")
     if (rig := parts.get("rig")) is not None:
         if not rig.cameras:
@@ -129,6 +131,9 @@ def check_units(survey: Survey, problems: Problems) -> None:
             path = f"stops[{index}].move (leg {stop.leg} stop {stop.stop})"
             _within(max(abs(stop.move.dx), abs(stop.move.dy)), LONGEST_MOVE_M, f"{path}.dx, dy", METRES, problems)
             _within(abs(stop.move.dheading), FULL_TURN, f"{path}.dheading", RADIANS, problems)
+            if stop.move.by_errors is not None:
+                largest = max(abs(value) for row in stop.move.by_errors for value in row)
+                _within(largest, LONGEST_MOVE_M, f"{path}.by_errors", METRES, problems)
 
 
 def _within(value: float, most: float, path: str, unit: str, problems: Problems) -> None:

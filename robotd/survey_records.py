@@ -31,12 +31,18 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """Motion between two stops (dx, dy in metres, dheading in radians) in the earlier robot frame, with covariance."""
+    """Motion between two stops (dx, dy in metres, dheading in radians) in the earlier robot frame, with covariance.
+
+    `by_errors` are the derivatives of dx, dy and dheading (a row each) by what is wrong with all moves alike: the
+    relative errors of scale and turns, and the drift in radians per metre. They depend on where between the stops the
+    robot turned; None: all the way, as along an arc.
+    """
 
     dx: float
     dy: float
     dheading: float
     covariance: Matrix3
+    by_errors: Matrix3 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +124,7 @@ class Priors:
     odometry_turn: float = 0.0
     odometry_drift: float = 0.0  # rad/m, by which unequal wheels turn the robot on a straight
     beacon_m: float = 0.0
+    odometry_correlation: float = 0.0  # of the errors of scale and turn: larger wheels make both larger
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ def steps_between(before, after, turned, line):
 
 def measured(steps, world, scale, base, rng):
     """The move that odometry makes of steps, with its covariance: noise of each wheel by its own travel."""
-    pose, P = np.zeros(3), np.zeros((3, 3))
+    pose, P, J = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     wheels = steps[:, :1] + 0.5 * WHEEL_BASE * steps[:, 1:] * [-1.0, 1.0]
     sigma = world.wheel * np.sqrt(np.abs(wheels))
     wheels = scale * wheels + sigma * rng.standard_normal(wheels.shape)
@@ -85,8 +85,10 @@ def measured(steps, world, scale, base, rng):
         G = np.array([[0.5 * c, 0.5 * c], [0.5 * s, 0.5 * s], [-1.0 / WHEEL_BASE, 1.0 / WHEEL_BASE]])
         G[:2] += 0.5 * travel * np.outer([-s, c], [-1.0 / WHEEL_BASE, 1.0 / WHEEL_BASE])
         P = F @ P @ F.T + G @ np.diag([sl**2, sr**2]) @ G.T
+        bent = np.array([-0.5 * travel * s, 0.5 * travel * c, 1.0])
+        J = F @ J + np.column_stack([[travel * c, travel * s, 0.0], bent * turn, bent * travel])
         pose += [travel * c, travel * s, turn]
-    return Move(float(pose[0]), float(pose[1]), float(wrap_angle(pose[2])), covariance(P))
+    return Move(float(pose[0]), float(pose[1]), float(wrap_angle(pose[2])), covariance(P), covariance(J))
 
 
 def tilt_of(place, sigma, phases):

@@ -137,7 +137,7 @@ def drive(poses, arc, index, world: World, rng) -> list[Move]:
     travel, turn = wheels.mean(axis=1), (wheels[:, 1] - wheels[:, 0]) / (base * WHEEL_BASE)
     moves = []
     for i, j in pairwise(index):
-        pose, P = np.zeros(3), np.zeros((3, 3))
+        pose, P, J = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
         for k in range(i, j):
             c, s = np.cos(pose[2] + 0.5 * turn[k]), np.sin(pose[2] + 0.5 * turn[k])
             F = np.array([[1.0, 0.0, -travel[k] * s], [0.0, 1.0, travel[k] * c], [0.0, 0.0, 1.0]])
@@ -150,12 +150,15 @@ def drive(poses, arc, index, world: World, rng) -> list[Move]:
                 ]
             )
             P = F @ P @ F.T + G @ G.T * max(world.wheel, WHEEL_NOISE) ** 2 * ds[k]
+            bent = np.array([-0.5 * travel[k] * s, 0.5 * travel[k] * c, 1.0])
+            J = F @ J + np.column_stack([[travel[k] * c, travel[k] * s, 0.0], bent * turn[k], bent * travel[k]])
             pose += [travel[k] * c, travel[k] * s, turn[k]]
-        moves.append(Move(pose[0], pose[1], wrap_angle(pose[2]), covariance(P)))
+        moves.append(Move(pose[0], pose[1], wrap_angle(pose[2]), covariance(P), covariance(J)))
     return moves
 
 
 def covariance(P):
+    """A matrix as a record carries it."""
     return tuple(tuple(row) for row in P.tolist())
 
 
@@ -246,7 +249,8 @@ def simulate(store, seed=0, world: World = World(), outliers=0.0):
         world.lens_px,
         world.lens_px,
         world.odometry,
-        world.odometry,
+        np.sqrt(2.0) * world.odometry,  # of the wheels' size and of their base
+        odometry_correlation=np.sqrt(0.5) if world.odometry else 0.0,
     )
     survey = Survey("test", rig, tuple(stops), sigmas=Sigmas(sigma, 1.0), priors=priors)
     return survey, in_axes_of(poses[index[0]], dict(zip(ids, where, strict=True)))

@@ -35,7 +35,7 @@ pytest.importorskip("robotd.solver._bundle", reason="built without extensions")
 
 NONE = Priors()
 TILT = Priors(tilt_rad=0.005)
-ALL = Priors(0.005, 0.001, 0.001, 0.3, 0.3, 0.004, 0.004, 0.01, 0.002)
+ALL = Priors(0.005, 0.001, 0.001, 0.3, 0.3, 0.004, 0.004, 0.01, 0.002, 0.7)
 ROOFS = ("roof", "exact", "idle")
 LENSES = {
     "pinhole": ("brown-conrady", (), None),

@@ -197,8 +197,12 @@ def test_the_commands_write_the_calibration_that_the_robot_reads(tmp_path, capsy
     assert (tmp_path / "rig.png").read_bytes()[:4] == b"\x89PNG"
     save_survey(replace(survey, rig=after.rig, priors=after.priors), tmp_path / "s.json")
     assert main(["calibrate", "odometry", *common]) == 0
+    odometry = json.loads(capsys.readouterr().out)["odometry"]
     wheels = load_calibration(tmp_path / "c.toml").wheels
     assert wheels.scale_left == wheels.scale_right == pytest.approx(factors[0], abs=0.008)
-    assert wheels.base == pytest.approx(Wheels().base * factors[0] / factors[1], abs=0.001)
+    base = Wheels().base * odometry["scale"]["factor"] / odometry["turn"]["factor"]
+    assert wheels.base == pytest.approx(base, abs=1e-6)
+    sigma = Wheels().base * np.hypot(odometry["scale"]["sigma"], odometry["turn"]["sigma"])
+    assert wheels.base == pytest.approx(Wheels().base * factors[0] / factors[1], abs=4.0 * sigma)
     assert main(["calibrate", "odometry", *common]) == 2
     assert "was corrected from rig" in capsys.readouterr().err

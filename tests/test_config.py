@@ -73,6 +73,17 @@ def test_a_calibration_survives_the_file_to_the_last_bit(tmp_path):
     assert load_calibration(tmp_path / "calibration.toml") == calibration
 
 
+def test_surveys_carry_what_the_wheels_calibration_left_and_that_floors_are_not_flat():
+    priors = Calibration(priors=Priors(camera_rotation_rad=0.001)).survey_priors
+    assert priors.odometry_scale == pytest.approx(0.003)
+    assert priors.odometry_turn == pytest.approx(0.003 * 2.0**0.5)
+    assert priors.odometry_correlation == pytest.approx(0.5**0.5)
+    assert (priors.odometry_drift, priors.camera_rotation_rad) == (0.0, 0.001)
+    assert priors.tilt_rad == pytest.approx(0.0052, abs=1e-4)
+    given = Priors(tilt_rad=0.01, odometry_scale=0.001)
+    assert Calibration(priors=given).survey_priors == given
+
+
 def test_cameras_must_have_different_names(tmp_path):
     camera = CameraModel("front", (640, 480), (268.5, 268.5, 319.5, 239.5), Transform((0, 0, 0), (0, 0, 0)))
     save_calibration(Calibration(cameras=(camera, camera)), tmp_path / "calibration.toml")

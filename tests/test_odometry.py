@@ -473,3 +473,27 @@ def test_without_noise_the_pose_stays_right_through_reversals_spins_and_stops():
     assert metres > 11.0
     assert math.hypot(*error[:2]) < 0.005 * metres
     assert abs(math.degrees(error[2])) < 1.0
+
+
+@given(st.lists(st.tuples(st.floats(-0.002, 0.006), st.floats(-0.002, 0.006)), min_size=1, max_size=60))
+@settings(deadline=None, max_examples=30)
+def test_a_move_says_what_errors_of_the_calibration_do_to_it(steps):
+    """Against driving the same way with wheels that have the errors."""
+
+    def driven(scale, turn, drift):
+        wheels = Wheels(base=0.235 * (1.0 + scale) / (1.0 + turn))
+        left, right = (1.0 + scale + sign * 0.5 * wheels.base * drift for sign in (-1.0, 1.0))
+        odometry = Odometry(dataclasses.replace(wheels, scale_left=left, scale_right=right))
+        odometry.update(0.0, 0.0, 0.0)
+        rolled = np.cumsum(steps, axis=0)
+        for k, (a, b) in enumerate(rolled.tolist(), start=1):
+            odometry.update(0.4 * k, a, b)
+        return odometry.move_since_mark()
+
+    exact = driven(0.0, 0.0, 0.0)
+    for column, h in enumerate((1e-6, 1e-6, 1e-6)):
+        errors = [h if k == column else 0.0 for k in range(3)]
+        ahead, behind = driven(*errors), driven(*(-value for value in errors))
+        change = np.array([ahead.dx - behind.dx, ahead.dy - behind.dy, ahead.dheading - behind.dheading])
+        change[2] = math.remainder(change[2], 2.0 * math.pi)
+        np.testing.assert_allclose(np.array(exact.by_errors)[:, column], change / (2.0 * h), atol=1e-5)

@@ -7,23 +7,25 @@ import pytest
 
 from robotd.geometry.homography import apply, fit
 from robotd.geometry.transforms import (
-    heading_matrix,
     pose_matrix,
     se2_compose,
 )
 from robotd.records import (
     BeaconSighting,
     KnownLabel,
+    Move,
     Pose,
     Priors,
     RoofCamera,
 )
 from robotd.solver import evaluate, solve
 from robotd.solver.bundle import Adjustment, Loss
-from robotd.solver.problem import State, build_problem, travelled
+from robotd.solver.problem import State, build_problem
 from robotd.solver.robust import optimise
+from robotd.solver.wheel_errors import arc_by_errors, move_by_errors
 from tests.store_surveys import (
     World,
+    covariance,
     in_legs,
     label_of,
     load,
@@ -199,9 +201,10 @@ def test_wheels_of_unequal_size_are_found_within_their_prior():
         if stop.move is None:
             return stop
         move = stop.move
-        way = travelled(np.array([[move.dx, move.dy, move.dheading]]))[0]
-        x, y = heading_matrix(-0.5 * drift * way) @ [move.dx, move.dy]
-        return replace(stop, move=replace(move, dx=x, dy=y, dheading=move.dheading - drift * way))
+        J = np.array(move.by_errors)
+        x, y, turn = [move.dx, move.dy, move.dheading] - drift * J[:, 2]
+        J[:2, 0] = x, y
+        return replace(stop, move=replace(move, dx=x, dy=y, dheading=turn, by_errors=covariance(J)))
 
     worn = replace(survey, stops=tuple(map(drifted, survey.stops)))
     allowed = replace(worn, priors=replace(worn.priors, odometry_drift=0.03))
@@ -210,3 +213,28 @@ def test_wheels_of_unequal_size_are_found_within_their_prior():
     problem = build_problem(allowed)
     assert optimise(problem).state.frame[-1] == pytest.approx(drift, abs=0.012)
     assert optimise(build_problem(worn)).state.frame[-1] == 0.0
+
+
+def test_where_the_robot_turned_tells_about_its_wheels_and_so_about_the_maps_size():
+    """The errors of eight maps, and how sure they are, with what a survey says of its moves' errors and without."""
+    world = World(reflections=0.0, wrong_ids=0.0, slip=0.0)
+    errors, sigmas, surprise = ([[], []] for _ in range(3))
+    for seed in range(8):
+        survey, truth = simulate(load("room"), seed, world)
+        for k, read in enumerate((survey, replace(survey, priors=replace(survey.priors, odometry_correlation=0.0)))):
+            result = solve(read)
+            errors[k].append(evaluate(result, truth).error_mm["mean"])
+            sigmas[k].append(np.mean([np.trace(m.covariance) for m in result.labels]) ** 0.5)
+            surprise[k] += nees(result, truth)
+    assert np.mean(sigmas[0]) < 0.92 * np.mean(sigmas[1])
+    assert np.mean(errors[0]) < 0.95 * np.mean(errors[1])
+    assert np.mean(surprise[0]) < 1.5
+
+
+def test_a_move_that_was_changed_alone_counts_as_an_arc():
+    move = Move(
+        1.0, 0.2, 0.4, covariance(np.eye(3)), covariance(np.array([[1.0, -0.3, 0.0], [0.2, 0.1, 0.5], [0, 1, 1]]))
+    )
+    np.testing.assert_array_equal(move_by_errors(move), move.by_errors)
+    changed = replace(move, dx=1.05)
+    np.testing.assert_allclose(move_by_errors(changed), arc_by_errors(np.array([1.05, 0.2, 0.4])))

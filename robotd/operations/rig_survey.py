@@ -49,7 +49,7 @@ class RigSurvey:
             stops=(),
             created=self._utc(),
             sigmas=robot.assembly.calibration.sigmas,
-            priors=robot.assembly.calibration.priors,
+            priors=robot.assembly.calibration.survey_priors,
             known_labels=self.config.known_labels,
         )
         self.observer = Observer(

@@ -152,7 +152,8 @@ class World:
                 focal_px=s.focal_error,
                 centre_px=s.centre_error,
                 odometry_scale=s.wheel_scale_error,
-                odometry_turn=math.hypot(s.wheel_scale_error, s.wheel_base_error),
+                odometry_turn=(turn := math.hypot(s.wheel_scale_error, s.wheel_base_error)),
+                odometry_correlation=s.wheel_scale_error / turn if turn else 0.0,
                 beacon_m=s.roof.beacon_error if self.layout.roof_cameras else 0.0,
             ),
         )

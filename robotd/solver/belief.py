@@ -19,11 +19,14 @@ from ..geometry.transforms import heading_matrix, invert_rigid, pose_matrix, se2
 from ..records import Floats
 from .bundle import SQUARE, Adjustment
 from .covariance import inverse
-from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Known, Moves, Problem, Sightings, State, travelled
+from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Known, Moves, Problem, Sightings, State
 from .robust import Optimum
+from .wheel_errors import arc_by_errors, coupling
 
 _POSE_SIGMA = 10.0  # metres and radians: where a stop would be, before anything there is measured
-_NO_MOVES = Moves(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+_NO_MOVES = Moves(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
+)
 MARGIN_PX = 2.0  # a light nearer to the image's border is not found
 
 
@@ -189,10 +192,8 @@ class Belief:
         by_after[:2, :2], by_after[2, 2] = R, 1.0
         by_before = -by_after
         by_before[0, 2], by_before[1, 2] = measured[1], -measured[0]
-        factor = np.zeros((3, ODOMETRY))
-        factor[:2, 0], factor[2, 1] = -measured[:2], -measured[2]
-        way = travelled(measured[None])[0]
-        factor[:, 2] = 0.5 * way * measured[1], -0.5 * way * measured[0], -way
+        factor = -arc_by_errors(measured)
+        factor[:, 0] += coupling(self.problem.survey.priors) * factor[:, 1]
         root = np.linalg.inv(np.linalg.cholesky(covariance))
         entries = np.concatenate([at, entry + np.arange(3), self._columns[-ODOMETRY:]])
         return Rows(root @ np.concatenate([by_before, by_after, factor], axis=1), np.tile(entries, (3, 1)))

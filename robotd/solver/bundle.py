@@ -19,7 +19,7 @@ import scipy.sparse
 from ..geometry.transforms import heading_matrix, pose_matrix, rotation_matrix, skew, wrap_angle
 from ..records import Floats
 from .kernel import SHAPES, compiled
-from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Bools, Ints, Problem, Sightings, State, travelled
+from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Bools, Ints, Problem, Sightings, State
 
 if TYPE_CHECKING:
     from ._bundle import Bundle
@@ -137,8 +137,7 @@ class Adjustment:
         self.after: Ints = np.concatenate([moves.after, motions.after])
         self.measured: Floats = np.concatenate([moves.measured, motions.measured])
         self.move_roots: Floats = np.concatenate([np.linalg.inv(np.linalg.cholesky(moves.covariance)), motions.root])
-        self.travelled: Floats = travelled(self.measured)
-        self.by_wheels: Floats = np.repeat([1.0, 0.0], [len(moves.before), len(motions.before)])
+        self.by_errors: Floats = np.concatenate([moves.by_errors, np.zeros((len(motions.before), 3, ODOMETRY))])
         self.known_here: Ints = np.flatnonzero(seen[problem.known.label])
         self.known_point: Ints = np.searchsorted(self.labels, problem.known.label[self.known_here])
 
@@ -253,23 +252,16 @@ class Adjustment:
         a, b = poses[self.before, :3], poses[self.after, :3]
         R_a_world = heading_matrix(a[:, 2]).transpose(0, 2, 1)
         shift = (R_a_world @ (b - a)[:, :2, None])[:, :, 0]
-        scale, turn, drift = self.by_wheels * state.frame[-ODOMETRY:, None]
-        # a drift bends the way, whose end lies half of the whole turn aside
-        aside = 0.5 * self.travelled[:, None] * measured[:, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
         residual = np.empty((len(a), 3))
-        residual[:, :2] = shift - (1.0 + scale[:, None]) * measured[:, :2] - drift[:, None] * aside
-        residual[:, 2] = wrap_angle(b[:, 2] - a[:, 2] - measured[:, 2]) - turn * measured[:, 2] - drift * self.travelled
+        residual[:, :2] = shift - measured[:, :2]
+        residual[:, 2] = wrap_angle(b[:, 2] - a[:, 2] - measured[:, 2])
+        residual -= self.by_errors @ state.frame[-ODOMETRY:]
         after = np.zeros((len(a), 3, 3))
         after[:, :2, :2], after[:, 2, 2] = R_a_world, 1.0
         before = -after
         before[:, 0, 2], before[:, 1, 2] = shift[:, 1], -shift[:, 0]
-        factor = np.zeros((len(a), 3, ODOMETRY))
-        factor[:, :2, 0] = -self.by_wheels[:, None] * measured[:, :2]
-        factor[:, 2, 1] = -self.by_wheels * measured[:, 2]
-        factor[:, :2, 2] = -self.by_wheels[:, None] * aside
-        factor[:, 2, 2] = -self.by_wheels * self.travelled
         L = self.move_roots
-        return (L @ residual[:, :, None])[:, :, 0], L @ before, L @ after, L @ factor
+        return (L @ residual[:, :, None])[:, :, 0], L @ before, L @ after, L @ -self.by_errors
 
     def _linear_roofs(self, poses: Floats, R_stop: Floats, state: State) -> tuple[Floats, Floats, Floats]:
         problem, roofs = self.problem, self.problem.roofs

@@ -276,6 +276,7 @@ def _loosened(survey: Survey, bounds: Bounds) -> Survey:
         camera_translation_m=bounds.each[1],
         odometry_scale=_FREE_ODOMETRY if metric else given.odometry_scale or _ODOMETRY,
         odometry_turn=_FREE_ODOMETRY,
+        odometry_correlation=0.0,
         beacon_m=0.0,
     )
     exact = tuple(

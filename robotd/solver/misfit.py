@@ -166,7 +166,9 @@ def _with_moves(survey: Survey, x: float, y: float, turn: float) -> Survey:
         if move is None:
             return None
         (a, b, c), (d, e, f), (g, h, i) = (scale @ np.array(move.covariance) @ scale).tolist()
-        return Move(move.dx * x, move.dy * y, move.dheading * turn, ((a, b, c), (d, e, f), (g, h, i)))
+        return Move(
+            move.dx * x, move.dy * y, move.dheading * turn, ((a, b, c), (d, e, f), (g, h, i))
+        )  # an arc's errors
 
     return replace(survey, stops=tuple(replace(stop, move=changed(stop.move)) for stop in survey.stops))
 

@@ -174,6 +174,7 @@ def detach(problem: Problem, placed: Bools) -> Problem:
             after=moves.after[keep],
             measured=moves.measured[keep],
             covariance=moves.covariance[keep],
+            by_errors=moves.by_errors[keep],
         ),
         motions=problem.motions.select(placed[problem.motions.after]),
         roofs=problem.roofs.select(seen),

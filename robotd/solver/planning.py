@@ -195,7 +195,7 @@ class _Planner:
         """Choose stops, give back those that others made needless, then leave out labels."""
         first = self.belief.P
         chosen, gains = self._grown()
-        chosen = self._lean(chosen, first)
+        chosen = self._order(self._lean(chosen, first))
         chosen = self._sparing(chosen, first)
         return self._told(chosen, first, gains)
 

@@ -6,7 +6,7 @@ The unknowns are a frame vector and the label points. The frame vector holds, in
     10 per camera   corrections: rotation vector (3) and translation (3) in camera-to-robot, fx, fy, cx, cy
     8 per roof      homography of a roof camera, along the principal axes of its covariance, in standard deviations
     2 per beacon    shift of its x, y in robot axes
-    3               errors of all odometry: scale (dx, dy) and turn (dheading), relative, and drift, radians per metre
+    3               errors of all odometry: scale, turns beyond what the scale's error makes expect, and drift
 
 Entries whose prior is zero, and the first stop's planar pose when nothing outside fixes the world frame, are held
 fixed: they have no column in the normal equations, so that a planar problem costs what a planar problem costs.
@@ -26,6 +26,7 @@ from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
 from ..records import CameraModel, Floats, Matrix3, Survey
 from ..survey_checks import Problems, check_roof, check_units
+from .wheel_errors import arc_by_errors, coupling, move_by_errors
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -70,12 +71,16 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moves:
-    """Odometry factors: `before`, `after` (M,) stops, `measured` (M, 3), `covariance` (M, 3, 3)."""
+    """Odometry factors: `before`, `after` (M,) stops, `measured` (M, 3), `covariance` (M, 3, 3).
+
+    `by_errors` (M, 3, 3) are derivatives of the measured by the three last entries of the frame vector.
+    """
 
     before: Ints
     after: Ints
     measured: Floats
     covariance: Floats
+    by_errors: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,6 +321,7 @@ def _check(survey: Survey) -> Columns:
         numbers = [stop.odometry.x, stop.odometry.y, stop.odometry.heading]
         if stop.move is not None:
             numbers += [stop.move.dx, stop.move.dy, stop.move.dheading, *np.ravel(stop.move.covariance)]
+            numbers += [] if stop.move.by_errors is None else [*np.ravel(stop.move.by_errors)]
         for motion in stop.motions:
             if not np.isfinite([motion.dx, motion.dy, motion.dheading, *np.ravel(motion.information)]).all():
                 problems.append(f"{at}: motion by {motion.source}: expected finite numbers, got {motion}")
@@ -387,24 +393,28 @@ def _semidefinite(rows: Matrix3) -> bool:
 
 def _moves(survey: Survey) -> tuple[Moves, list[str]]:
     after = [f for f in range(1, len(survey.stops)) if survey.stops[f - 1].leg == survey.stops[f].leg]
-    measured, covariance, notes = [], [], []
+    measured, covariance, by_errors, notes = [], [], [], []
     for f in after:
         stop, before = survey.stops[f], survey.stops[f - 1]
         if stop.move is not None and stop.stop == before.stop + 1:
             measured.append(np.array([stop.move.dx, stop.move.dy, stop.move.dheading]))
             covariance.append(np.array(stop.move.covariance) + COVARIANCE_FLOOR)
+            by_errors.append(move_by_errors(stop.move))
             continue
         # a stop between is missing, so that the move starts somewhere else; the odometry poses still say something
         move = se2_relative(pose_array(before.odometry), pose_array(stop.odometry))
         distance = float(np.hypot(move[0], move[1]))
         measured.append(move)
+        by_errors.append(arc_by_errors(move))
         covariance.append(np.diag([0.02 + 0.05 * distance, 0.02 + 0.05 * distance, 0.05 + 0.05 * distance]) ** 2)
         notes.append(
             f"leg {stop.leg}: no move leads from stop {before.stop} to stop {stop.stop}; "
             "their odometry poses were used instead, with wide margins"
         )
-    index = np.array(after, dtype=np.int64)
-    return Moves(index - 1, index, np.array(measured).reshape(-1, 3), np.array(covariance).reshape(-1, 3, 3)), notes
+    index, derivatives = np.array(after, dtype=np.int64), np.array(by_errors).reshape(-1, 3, 3)
+    derivatives[:, :, 0] += coupling(survey.priors) * derivatives[:, :, 1]
+    covariances = np.array(covariance).reshape(-1, 3, 3)
+    return Moves(index - 1, index, np.array(measured).reshape(-1, 3), covariances, derivatives), notes
 
 
 def _motions(survey: Survey) -> Motions:
@@ -486,10 +496,6 @@ def _prior_sigma(survey: Survey, roofs: Roofs, axes: Floats, fixed_first: bool) 
     seen = np.isin(np.arange(len(survey.rig.beacons)), roofs.which)
     plane = np.where(watches[:, None] & axes.any(axis=(2, 3)), 1.0, 0.0)
     beacons = np.repeat(np.where(seen, p.beacon_m, 0.0), BEACON)
-    odometry = [p.odometry_scale, p.odometry_turn, p.odometry_drift]
+    alone = 1.0 - p.odometry_correlation**2 if p.odometry_scale > 0.0 else 1.0
+    odometry = p.odometry_scale, p.odometry_turn * np.sqrt(max(alone, 1e-6)), p.odometry_drift
     return np.concatenate([stops.ravel(), cameras, plane.ravel(), beacons, odometry])
-
-
-def travelled(moves: Floats) -> Floats:
-    """(M,) metres of way that moves (M, 3) took, if it was an arc."""
-    return np.asarray(np.hypot(moves[:, 0], moves[:, 1]) / np.sinc(0.5 * moves[:, 2] / np.pi))

@@ -53,7 +53,7 @@ class Drive:
 
     def move(self, begin, end):
         """The moves between two of all the stops as one, with the covariance that they have together."""
-        pose, P = np.zeros(3), np.zeros((3, 3))
+        pose, P, J = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
         for stop in self.survey.stops[begin + 1 : end + 1]:
             step = np.array([stop.move.dx, stop.move.dy, stop.move.dheading])
             R = heading_matrix(pose[2])
@@ -61,8 +61,9 @@ class Drive:
             F[:2, 2] = R @ [-step[1], step[0]]
             G[:2, :2] = R
             P = F @ P @ F.T + G @ np.array(stop.move.covariance) @ G.T
+            J = F @ J + G @ np.array(stop.move.by_errors)
             pose = se2_compose(pose, step)
-        return Move(*pose.tolist(), covariance(0.5 * (P + P.T)))
+        return Move(*pose.tolist(), covariance(0.5 * (P + P.T)), covariance(J))
 
 
 def drive(name, seed, world=WORLD, every=None):
