@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +60,13 @@ def run(arguments: argparse.Namespace) -> int:
         f"{what} {value:.2f} +- {sigma:.2f}"
         for what, value, sigma in zip(("fx", "fy", "cx", "cy"), result.camera.matrix, sigmas, strict=True)
     )
-    held = ", ".join(f"{kind} {error:.3f}" for kind, error in result.held_out_px.items())
-    _say(f"{len(views)} pictures, {result.kind} {result.rms_px:.3f} px rms (held out: {held}); {numbers} px")
-    _say(f"the lens holds up to {result.reach_px:.0f} px from its centre")
+    _say(f"{len(views)} pictures, {result.kind} {result.rms_px:.3f} px rms; {numbers} px")
+    _say(f"held out, px rms: {result.held_out_words}")
+    for words in result.doubts:
+        _say(words)
+    _say(
+        f"the lens holds up to {result.reach_px:.0f} px from its centre, in {100.0 * result.share:.0f} % of the picture"
+    )
     return _done(arguments, before)
 
 
@@ -243,6 +248,9 @@ def _summary(result: LensCalibration, views: list[View]) -> dict[str, Any]:
         "sigma_px": result.sigmas.tolist(),
         "covariance_px2": result.covariance.tolist(),
         "reach_px": result.reach_px,
+        "share": result.share,
+        "disagreement": result.disagreement,
+        "board": None if result.bend is None else asdict(result.bend),
         "pictures": {
             view.name: float(np.sqrt(np.mean(left**2))) for view, left in zip(views, result.residuals, strict=True)
         },

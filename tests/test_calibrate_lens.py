@@ -14,8 +14,9 @@ from robotd.errors import ConfigError, InputError, SolverError
 from robotd.geometry.camera import Camera
 from robotd.geometry.transforms import rotation_matrix
 from robotd.records import CameraModel, Transform
+from robotd.solver.board_shape import BoardShape
 from robotd.solver.calibrate_floor import Board
-from robotd.solver.calibrate_lens import _choose, calibrate_lens
+from robotd.solver.calibrate_lens import Candidate, _choose, calibrate_lens
 from robotd.solver.lens_fit import View, camera_model, fit_lens, lens_jacobian, refine
 from robotd.solver.matlab_lens import load_matlab
 from robotd.solver_main import main
@@ -28,7 +29,7 @@ BROWN = np.array([420.0, 418.0, 322.0, 238.0, -0.30, 0.10, 0.0005, -0.0004, -0.0
 FISHEYE = np.array([200.0, 201.0, 318.0, 242.0, 0.03, -0.01, 0.002, -0.0005])
 
 
-def poses(kind, lens, count, seed, tilt=0.7, near=0.2, far=0.7, middle=0.0):
+def poses(kind, lens, count, seed, tilt=0.7, near=0.2, far=0.7, middle=0.0, shapes=(POINTS,)):
     """Boards that lie wholly in the picture, facing the camera but for a tilt, their middles all over it."""
     rng, camera = np.random.default_rng(seed), Camera(camera_model(kind, lens, SIZE))
     out = []
@@ -43,7 +44,7 @@ def poses(kind, lens, count, seed, tilt=0.7, near=0.2, far=0.7, middle=0.0):
         sine = float(np.linalg.norm(axis))
         facing = rotation_matrix(axis / max(sine, 1e-9) * math.atan2(sine, ray[2]))
         R = (facing @ turn) if tilt > 0.1 else turn
-        pixels, valid = camera.project(POINTS @ R.T + ray * distance)
+        pixels, valid = camera.project(shapes[len(out) % len(shapes)] @ R.T + ray * distance)
         if valid.all() and camera.in_image(pixels, 12.0).all():
             out.append((R, ray * distance, pixels))
     return out
@@ -87,7 +88,7 @@ def test_the_stated_uncertainty_is_that_of_the_errors(kind, lens):
         noisy = [View(v.name, v.points, v.pixels + rng.normal(0.0, 0.2, v.pixels.shape)) for v in exact]
         fit = refine(start, noisy, SIZE)
         scatter = fit.cost / (fit.residuals.size - len(lens) - 6 * len(noisy))
-        covariance = scatter * np.linalg.inv(fit.information)[:4, :4]
+        covariance = scatter * np.linalg.inv(fit.information.sum(axis=0))[:4, :4]
         error = fit.lens[:4] - lens[:4]
         nees.append(error @ np.linalg.solve(covariance, error))
     assert abs(np.mean(nees) / 4.0 - 1.0) < 3.0 * math.sqrt(8.0 / count) / 4.0
@@ -130,9 +131,65 @@ def test_the_lens_is_called_valid_as_far_as_corners_reached():
 def test_a_gain_of_nothing_is_not_worth_more_coefficients():
     rng = np.random.default_rng(1)
     plain = rng.uniform(0.009, 0.011, 20)
-    assert _choose({"brown-conrady": plain, "rational": 0.995 * plain}) == "brown-conrady"
-    assert _choose({"brown-conrady": plain, "rational": 0.8 * plain}) == "rational"
-    assert _choose({"brown-conrady": np.full(20, np.inf), "fisheye": plain}) == "fisheye"
+    brown, rational, fisheye = (Candidate(kind, False) for kind in ("brown-conrady", "rational", "fisheye"))
+    bent = Candidate("brown-conrady", True)
+    assert _choose({brown: plain, rational: 0.995 * plain, bent: 0.995 * plain}) == brown
+    assert _choose({brown: plain, rational: 0.8 * plain}) == rational
+    assert _choose({brown: plain, rational: 0.995 * plain, bent: 0.8 * plain}) == bent
+    assert _choose({brown: np.full(20, np.inf), fisheye: plain}) == fisheye
+    far_off = plain + 9.0 * (np.arange(20) == 3)
+    assert _choose({brown: 1.5 * far_off, fisheye: plain}) == fisheye, "one picture's error made the scatter a tie"
+
+
+# ---- boards that are not flat ----------------------------------------------------------------------------------------
+
+
+def bowed(height, stretch=0.0, about_x=False):
+    """The board as a part of a cylinder, its middle so many metres before its ends."""
+    along = POINTS[:, 1 if about_x else 0]
+    z = height * (1.0 - (along / along.max()) ** 2)
+    return POINTS * [1.0 + stretch, 1.0, 1.0] + np.column_stack([np.zeros((54, 2)), z])
+
+
+@pytest.mark.parametrize(("kind", "lens"), [("brown-conrady", BROWN), ("fisheye", FISHEYE)])
+def test_a_board_bent_by_a_millimetre_is_found_and_does_not_change_the_focal_length(kind, lens):
+    """Taken as flat, it makes the focal length 0.5 to 2 % wrong, which is ten standard deviations."""
+    scene = views(kind, lens, 14, seed=3, shapes=(bowed(1e-3, stretch=0.004),))
+    scene[::2] = [View(v.name, v.points, v.pixels[::-1]) for v in scene[::2]]  # from the board's other end
+    result = calibrate_lens(scene, SIZE, "front", (kind,))
+    assert result.bend.height == pytest.approx(1e-3, abs=4.0 * result.bend.height_sigma)
+    assert result.bend.stretch == pytest.approx(0.004, abs=4.0 * result.bend.stretch_sigma)
+    assert result.bend.height_sigma < 2e-4
+    assert np.array(result.camera.matrix) == pytest.approx(lens[:4], abs=4.0 * result.sigmas.max())
+    assert result.sigmas[:2].max() < 0.004 * lens[0]
+    assert "not flat and square" in " ".join(result.doubts)
+
+
+def test_a_flat_board_is_taken_as_flat():
+    assert calibrated("brown-conrady").bend is None
+    assert calibrated("brown-conrady").disagreement < 1.5
+    assert calibrated("brown-conrady").doubts == ()
+
+
+def test_a_board_that_bends_from_picture_to_picture_raises_the_stated_uncertainty():
+    shapes = tuple(bowed(h, about_x=x) for h in (1e-3, -1e-3) for x in (False, True))
+    flat = calibrated("brown-conrady")
+    result = calibrate_lens(
+        views("brown-conrady", BROWN, shapes=shapes, seed=5), SIZE, "front", ("brown-conrady",), False
+    )
+    assert result.disagreement > 1.5
+    assert "pictures disagree" in " ".join(result.doubts)
+    assert result.sigmas[0] > 2.0 * flat.sigmas[0]
+    assert (np.abs(np.array(result.camera.matrix) - BROWN[:4]) < 4.0 * result.sigmas).all()
+
+
+def test_the_modes_of_a_board_are_neither_shifts_nor_tilts_and_look_the_same_from_its_other_end():
+    board = BoardShape(POINTS)
+    modes = board.modes(POINTS)
+    assert modes == pytest.approx(modes[::-1] * np.array([-1.0, -1.0, 1.0])[:, None], abs=1e-9)
+    heights = modes[:, 2, 2:]
+    assert np.abs(heights.T @ np.column_stack([np.ones(54), POINTS[:, :2]])).max() < 1e-9
+    assert heights.T @ heights == pytest.approx(54.0 * np.eye(len(board) - 2), abs=1e-9)
 
 
 # ---- what is missing -------------------------------------------------------------------------------------------------
@@ -150,7 +207,7 @@ def test_too_few_pictures_are_refused_and_repeated_ones_count_once():
 
 
 def test_boards_without_tilt_are_refused():
-    refused(views("brown-conrady", BROWN, tilt=0.02), "tilt them by 30 to 45 degrees", whole=False)
+    refused(views("brown-conrady", BROWN, 10, tilt=0.02), "tilt them by 30 to 45 degrees", whole=False)
 
 
 def test_corners_that_leave_out_a_border_are_refused_and_the_border_named():
@@ -169,6 +226,28 @@ def test_a_picture_that_does_not_belong_is_named():
     scene = views("brown-conrady", BROWN)
     scene[7] = View("bent", POINTS, scene[7].pixels + 3.0 * np.sin(np.arange(108).reshape(54, 2)))
     refused(scene, "worst bent with")
+
+
+def test_a_picture_of_another_camera_is_named_though_it_fits_by_itself():
+    scene = views("brown-conrady", BROWN, 16)
+    longer = BROWN * np.array([1.12, 1.12, *[1.0] * 7])
+    refused(
+        [*scene, View("other", POINTS, views("brown-conrady", longer, 1, seed=2)[0].pixels)], "^other shows another"
+    )
+
+
+def test_corners_that_leave_out_all_borders_a_little_are_refused_or_told():
+    inner = []
+    for view in views("brown-conrady", BROWN, 24):
+        seen = (np.abs(view.pixels - [319.5, 239.5]) < [175.0, 130.0]).all(axis=1)
+        if seen.sum() > 20:
+            inner.append(View(view.name, view.points[seen], view.pixels[seen]))
+    refused(
+        inner, r"circle around the middle \d+ % of the picture; hold the board into its corners, too; or, .*--partial"
+    )
+    result = calibrate_lens(inner, SIZE, "front", ("brown-conrady",), False)
+    assert result.share < 0.5
+    assert "nothing seen there will be used" in " ".join(result.doubts)
 
 
 # ---- the command -----------------------------------------------------------------------------------------------------

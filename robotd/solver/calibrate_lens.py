@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,22 +19,55 @@ from ..errors import SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import skew
 from ..records import CameraModel, Floats
-from .lens_fit import LensFit, LensKind, View, camera_model, fit_lens, lens_jacobian, pose_views, refine, without
+from .board_shape import BoardShape
+from .lens_fit import LensFit, LensKind, View, bent, camera_model, fit_lens, lens_jacobian, pose_views, refine, without
 
 LEAST_VIEWS = 8  # different pictures: Zhang (PAMI 22(11), 2000) needs 3, and held-out pictures must stay out
 LEAST_MOVE = 0.01  # of the picture's width, by which corners must differ between different pictures
 LEAST_TURN = math.radians(20.0)  # between the boards' planes
 LEAST_DEPTH = 1.3  # ratio of the farthest board to the nearest
-BORDER = (
-    0.25  # of the picture's side: corners must come as near to each border; what lies beyond them `_reach` leaves out
-)
+BORDER = 0.25  # of the picture's side: corners must come as near to each border. Drawn lenses with 0.15 px of what no
+# model has, corners up to a quarter from one border: errors there reach 0.46 px; up to 35 %, 0.92 px
+PARTLY = "; or, if what is seen there is of no use, --partial"
 MOST_RMS = 1.0  # px
 MOST_SIGMA_FOCAL = 0.01  # of the focal length
 MOST_SIGMA_PIXEL = 0.5  # px, up to which the lens is called valid
 WORST = 5.0  # times the median of all pictures: the rms of one that does not belong to them
+STRANGE = 15.0  # times what the corners' scatter, or the median picture, explains: a lens of its own. Pictures of
+# lenses 5 % longer reach 34, boards that bend by 1 mm from picture to picture 5 times their median
+SHAKY = 1.5  # disagreement from which it is told
+LEAST_SHARE = 0.5  # of the picture, in a circle around the lens's centre in which there are corners
 FOLDS = 5
+LEAST_INFORMATION = 1e-6  # of all pictures', in a direction: what one picture tells less of is rounding
+HOPELESS = 25.0  # times the best squared error with a flat board: no shape of the board saves such a lens model
+TINY = 1e-12  # square pixels: drawn pictures may have no error at all
 TIE = 0.02  # of the held-out squared error: less is not worth another model
 ORDER: tuple[LensKind, ...] = ("brown-conrady", "fisheye", "rational")  # on a tie the first one
+
+
+@dataclass(frozen=True, slots=True)
+class Bend:
+    """A board that is not flat: from its lowest to its highest corner, and by how much longer its x side is than y.
+
+    `height` in metres and `stretch` relative, each with its standard deviation.
+    """
+
+    height: float
+    height_sigma: float
+    stretch: float
+    stretch_sigma: float
+
+
+class Candidate(NamedTuple):
+    """A lens model, with a board that is flat or whose shape is fitted, too."""
+
+    kind: LensKind
+    bent: bool
+
+    @property
+    def words(self) -> str:
+        """As the held-out errors are listed."""
+        return f"{self.kind} with a bent board" if self.bent else self.kind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +91,13 @@ class LensCalibration:
         Distance from the principal point up to which the lens was seen and is known to half a pixel.
     residuals : tuple of (N, 2) arrays, one per picture
         Fitted less seen corners, in pixels.
+    share : float
+        Of the picture, within reach.
+    bend : Bend or None
+        Of the board; None if it is flat, so far as pictures show.
+    disagreement : float
+        By how much more than their corners' scatter the pictures disagree about the lens; what is above 1 has been
+        applied to the covariance.
     """
 
     camera: CameraModel
@@ -66,6 +107,45 @@ class LensCalibration:
     covariance: Floats
     reach_px: float
     residuals: tuple[Floats, ...]
+    share: float
+    bend: Bend | None
+    disagreement: float
+
+    @property
+    def held_out_words(self) -> str:
+        """The held-out errors of every model tried."""
+        flat, bends = (
+            ", ".join(
+                f"{one} {self.held_out_px[word]:.3f}"
+                for one in ORDER
+                if (word := Candidate(one, bend).words) in self.held_out_px
+            )
+            for bend in (False, True)
+        )
+        return f"flat board {flat}; bent board {bends}"
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What a person must know about the board and the pictures."""
+        words = []
+        if self.bend is not None:
+            one = self.bend
+            words.append(
+                f"the board is not flat and square: {1e3 * one.height:.2f} +- {1e3 * one.height_sigma:.2f} mm from its"
+                f" lowest to its highest corner, {100.0 * one.stretch:+.2f} +- {100.0 * one.stretch_sigma:.2f} % longer"
+                " along its rows than across; the lens was fitted with that shape"
+            )
+        if self.share < LEAST_SHARE:
+            words.append(
+                f"beyond {self.reach_px:.0f} px from its centre the lens is not seen, or uncertain by more than"
+                f" {MOST_SIGMA_PIXEL:g} px, and nothing seen there will be used; more and sharper pictures show more"
+            )
+        if self.disagreement > SHAKY:
+            words.append(
+                f"pictures disagree about the lens {self.disagreement:.1f} times as much as their corners scatter, and"
+                " its standard deviations have been raised by as much; is the board stiff, and held still?"
+            )
+        return tuple(words)
 
     @property
     def sigmas(self) -> Floats:
@@ -82,8 +162,8 @@ def calibrate_lens(
 ) -> LensCalibration:
     """Fit and choose a lens model.
 
-    Chosen is the first of `ORDER` whose held-out squared error is not worse than the best one's by more than 2 %, or
-    than twice the standard error of the difference over the pictures.
+    Chosen is the first of `ORDER`, with a flat board or else with a bent one, whose held-out squared error is not worse
+    than the best one's by more than 2 %, or than twice the standard error of the difference over the pictures.
 
     Parameters
     ----------
@@ -96,27 +176,41 @@ def calibrate_lens(
     kinds : sequence of str
         Models to choose from.
     whole : bool
-        Refuse corners that leave out a border of the picture. False for a fisheye's round image, or if only the middle
-        is of use: `valid_radius_px` says how far the lens holds.
+        Refuse corners that leave out a border or half of the picture. False for a fisheye's round image, or if only the
+        middle is of use: `valid_radius_px` says how far the lens holds.
 
     Raises
     ------
     SolverError
         If the pictures do not determine the lens; the message names all that is missing.
     """
-    missing = _too_few(views, size)
-    if whole:
-        missing += _border(views, size)
-    if missing:
-        raise SolverError(_refusal(missing))
-    fits = {kind: fit for kind in ORDER if kind in kinds and (fit := fit_lens(kind, views, size)) is not None}
-    if not fits:
+    few, border = _too_few(views, size), _border(views, size) if whole else []
+    if few or border:
+        raise SolverError(_refusal(few + border) + (PARTLY if border else ""))
+    flat = {kind: fit for kind in ORDER if kind in kinds and (fit := fit_lens(kind, views, size)) is not None}
+    if not flat:
         raise SolverError("no lens model fits the corners; is the board flat, and are all pictures from one camera?")
-    errors = {kind: _held_out(fit, views, size) for kind, fit in fits.items()}
-    kind = _choose(errors)
-    fit = fits[kind]
+    board = BoardShape(np.concatenate([view.points for view in views]))
+    fits = {Candidate(kind, False): fit for kind, fit in flat.items()}
+    errors = {one: _held_out(fit, views, size, board) for one, fit in fits.items()}
+    least = min(float(np.mean(each)) for each in errors.values())
+    for kind, fit in flat.items():
+        if np.mean(errors[Candidate(kind, False)]) <= HOPELESS * least:
+            one = Candidate(kind, True)
+            fits[one] = refine(bent(fit, board), views, size, board=board)
+            errors[one] = _held_out(fits[one], views, size, board)
+    chosen = _choose(errors)
+    kind, fit = chosen.kind, fits[chosen]
     _consistent(fit, views)
-    lens_covariance = _covariance(fit)
+    apart, parts = _disagreement(fit)
+    stranger = int(np.argmax(parts))
+    if parts[stranger] > STRANGE * max(float(np.median(parts)), 1.0):
+        raise SolverError(
+            f"{views[stranger].name} shows another lens than all other pictures do; leave it out if it is of another"
+            " camera, of other settings (zoom, focus, cropping), or of another board"
+        )
+    covariance = _covariance(fit) * max(apart, 1.0) ** 2
+    lens_covariance = covariance[: len(fit.lens), : len(fit.lens)]
     missing = _flat(fit, views)
     relative = float((np.sqrt(np.diag(lens_covariance))[:2] / fit.lens[:2]).max())
     if not relative <= MOST_SIGMA_FOCAL and not missing:
@@ -128,15 +222,22 @@ def calibrate_lens(
         raise SolverError(_refusal(missing))
     record = camera_model(kind, fit.lens, size, name)
     reach = _reach(record, kind, fit.lens, lens_covariance, views)
+    share, seen = _share(record, reach), _share(record, _farthest(record, views))
+    if whole and seen < LEAST_SHARE:
+        middle = f"all corners lie in a circle around the middle {100.0 * seen:.0f} % of the picture; hold the board"
+        raise SolverError(_refusal([f"{middle} into its corners, too"]) + PARTLY)
     far = max(math.hypot(u - fit.lens[2], v - fit.lens[3]) for u in (0, size[0] - 1) for v in (0, size[1] - 1))
     return LensCalibration(
         record if reach >= far else replace(record, valid_radius_px=round(reach, 1)),
         kind,
         math.sqrt(fit.cost / fit.residuals.size),
-        {one: math.sqrt(float(np.mean(each))) for one, each in errors.items()},
+        {one.words: math.sqrt(float(np.mean(each))) for one, each in errors.items()},
         lens_covariance[:4, :4],
         reach,
         tuple(np.split(fit.residuals, np.cumsum([len(view.points) for view in views])[:-1])),
+        share,
+        _bend(fit, covariance, board, views),
+        apart,
     )
 
 
@@ -213,41 +314,86 @@ def _consistent(fit: LensFit, views: Sequence[View]) -> None:
 # ---- which model, how sure -------------------------------------------------------------------------------------------
 
 
-def _held_out(fit: LensFit, views: Sequence[View], size: tuple[int, int]) -> Floats:
+@np.errstate(over="ignore", invalid="ignore")
+def _held_out(fit: LensFit, views: Sequence[View], size: tuple[int, int], board: BoardShape) -> Floats:
     """(P,) mean squared errors of every picture under a lens fitted to the others; infinite if it does not hold."""
     errors = np.full(len(views), np.inf)
     for fold in range(FOLDS):
-        held = [k for k in range(len(views)) if k % FOLDS == fold]
         rest = [k for k in range(len(views)) if k % FOLDS != fold]
-        lens = refine(without(fit, rest), [views[k] for k in rest], size)
-        posed = pose_views(lens, [views[k] for k in held], size)
+        lens = refine(without(fit, rest), [views[k] for k in rest], size, board=board)
+        held = list(range(fold, len(views), FOLDS))
+        posed = pose_views(lens, [views[k] for k in held], size, board)
         if posed is not None:
             parts = np.split(posed.residuals, np.cumsum([len(views[k].points) for k in held])[:-1])
             errors[held] = [float(np.mean(part**2)) for part in parts]
-    return errors
+    return np.where(np.isfinite(errors), errors, np.inf)
 
 
-def _choose(errors: dict[LensKind, Floats]) -> LensKind:
-    best = min(errors, key=lambda kind: float(np.mean(errors[kind])))
-    for kind in ORDER:
-        if kind in errors and np.isfinite(errors[kind]).all():
-            worse = errors[kind] - errors[best]
-            tie = max(2.0 * worse.std(ddof=1) / math.sqrt(len(worse)), TIE * float(np.mean(errors[best])))
+def _choose(errors: dict[Candidate, Floats]) -> Candidate:
+    """The first that predicts pictures as well as the best one.
+
+    Errors are compared by their logarithms, picture by picture: one at the border, in which a wrong model is far off,
+    would otherwise make the scatter so large that it counts as a tie.
+    """
+    whole = {one: np.log(np.maximum(each, TINY)) for one, each in errors.items() if np.isfinite(each).all()}
+    if not whole:
+        return min(errors, key=lambda one: int(np.isinf(errors[one]).sum()))
+    best = min(whole, key=lambda one: float(np.mean(whole[one])))
+    for one in (Candidate(kind, bend) for bend in (False, True) for kind in ORDER):
+        if one in whole:
+            worse = whole[one] - whole[best]
+            tie = max(2.0 * worse.std(ddof=1) / math.sqrt(len(worse)), math.log1p(TIE))
             if worse.mean() <= tie:
-                return kind
+                return one
     return best
 
 
+def _scatter(fit: LensFit) -> float:
+    """Variance of a corner's coordinate, estimated from the residuals, in square pixels."""
+    unknowns = len(fit.lens) + len(fit.shape) + 6 * len(fit.t)
+    return fit.cost / max(fit.residuals.size - unknowns, 1)
+
+
 def _covariance(fit: LensFit) -> Floats:
-    """(4 + K, 4 + K) of the lens, with the corners' scatter estimated from the residuals."""
-    unknowns = len(fit.lens) + 6 * len(fit.t)
-    scatter = fit.cost / max(fit.residuals.size - unknowns, 1)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
-    return np.asarray(
-        scatter
-        * np.linalg.pinv(fit.information * np.outer(scale, scale), 1e-13, hermitian=True)
-        * np.outer(scale, scale)
+    """(4 + K + S, 4 + K + S) of the lens and the board's shape if all that is wrong is the corners' own scatter."""
+    information = fit.information.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), 1e-13, hermitian=True)
+    return np.asarray(_scatter(fit) * inverse * np.outer(scale, scale))
+
+
+def _bend(fit: LensFit, covariance: Floats, board: BoardShape, views: Sequence[View]) -> Bend | None:
+    if not len(fit.shape):
+        return None
+    points = np.unique(np.concatenate([view.points for view in views]), axis=0)
+    modes = board.modes(points)
+    heights = modes[:, 2] @ fit.shape
+    apart = modes[int(np.argmax(heights)), 2] - modes[int(np.argmin(heights)), 2]
+    P = covariance[len(fit.lens) :, len(fit.lens) :]
+    return Bend(
+        float(np.ptp(heights)),
+        math.sqrt(max(float(apart @ P @ apart), 0.0)),
+        2.0 * float(fit.shape[0]),
+        2.0 * math.sqrt(max(float(P[0, 0]), 0.0)),
     )
+
+
+def _disagreement(fit: LensFit) -> tuple[float, Floats]:
+    """By how much pictures disagree about the lens, as a multiple of what their corners' scatter explains.
+
+    Cochran's Q over its degrees of freedom, and its root (the Birge ratio of metrology): 1 if all pictures show one
+    lens and one board; more if the board bends from picture to picture or errors of neighbouring corners are alike.
+    Also each picture's part (P,) of it, squared: about 1, and many times that of the others if it alone differs.
+    """
+    total = fit.information.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+    Q, freedom = np.zeros(len(fit.t)), np.ones(len(fit.t))
+    for k, (information, score) in enumerate(zip(fit.information, fit.scores, strict=True)):
+        values, axes = np.linalg.eigh(information * np.outer(scale, scale))
+        shown = values > LEAST_INFORMATION
+        Q[k] = np.sum((axes[:, shown].T @ (score * scale)) ** 2 / values[shown]) / _scatter(fit)
+        freedom[k] = max(int(shown.sum()), 1)
+    return math.sqrt(float(Q.sum() / max(freedom.sum() - len(total), 1.0))), Q / freedom
 
 
 def lens_sigmas(model: CameraModel, kind: LensKind, covariance: Floats, pixels: Floats) -> Floats:
@@ -283,12 +429,26 @@ def lens_sigmas(model: CameraModel, kind: LensKind, covariance: Floats, pixels: 
     return out
 
 
+def _grid(size: tuple[int, int]) -> Floats:
+    """(N, 2) pixels spread over a picture."""
+    v, u = np.meshgrid(np.linspace(0.0, size[1] - 1.0, 25), np.linspace(0.0, size[0] - 1.0, 33))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def _farthest(model: CameraModel, views: Sequence[View]) -> float:
+    corners = np.concatenate([view.pixels for view in views])
+    return float(np.linalg.norm(corners - model.matrix[2:], axis=1).max())
+
+
+def _share(model: CameraModel, reach: float) -> float:
+    """Of the picture, within so many pixels of the lens's centre."""
+    return float(np.mean(np.linalg.norm(_grid(model.size) - model.matrix[2:], axis=1) <= reach))
+
+
 def _reach(model: CameraModel, kind: LensKind, lens: Floats, covariance: Floats, views: Sequence[View]) -> float:
     """Up to the farthest corner, but not to where the lens is uncertain or folds over."""
-    corners = np.concatenate([view.pixels for view in views])
-    reach = float(np.linalg.norm(corners - lens[2:4], axis=1).max())
-    v, u = np.meshgrid(np.linspace(0.0, model.size[1] - 1.0, 25), np.linspace(0.0, model.size[0] - 1.0, 33))
-    grid = np.column_stack([u.ravel(), v.ravel()])
+    reach = _farthest(model, views)
+    grid = _grid(model.size)
     away = np.linalg.norm(grid - lens[2:4], axis=1)
     near = away <= reach
     bad = lens_sigmas(model, kind, covariance, grid[near]) > MOST_SIGMA_PIXEL

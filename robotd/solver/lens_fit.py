@@ -1,4 +1,4 @@
-"""The least-squares core of a lens calibration: one lens and one board pose per picture, fitted to corners.
+"""The least-squares core of a lens calibration: one lens, one board, its pose in each picture, fitted to corners.
 
 Levenberg-Marquardt on the camera model that the robot itself uses (`geometry.camera.Camera`), so that what is fitted is
 what is applied later, rays at more than 90 degrees from the axis included. The poses are eliminated block by block
@@ -17,6 +17,7 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..geometry.transforms import rotation_matrix, skew
 from ..records import CameraModel, Floats, Transform
+from .board_shape import BoardShape
 
 LensKind = Literal["brown-conrady", "rational", "fisheye"]
 COEFFICIENTS: dict[LensKind, int] = {"brown-conrady": 5, "rational": 8, "fisheye": 4}
@@ -58,21 +59,28 @@ class LensFit:
         fx, fy, cx, cy and the distortion coefficients in OpenCV's order.
     R, t : (P, 3, 3) and (P, 3) arrays
         Board axes to camera axes, metres.
+    shape : (S,) array
+        How the board deviates from a plane with square squares, see `BoardShape`; empty if it is taken as flat.
     residuals : (N, 2) array
         Fitted less seen, of all pictures in order, in pixels.
     cost : float
         Sum of their squares.
-    information : (4 + K, 4 + K) array
-        Of the lens with the poses eliminated, for corners of 1 px; empty where the lens was held.
+    information : (P, 4 + K + S, 4 + K + S) array
+        What each picture tells of the lens and the shape, its pose eliminated, for corners of 1 px; empty where both
+        were held.
+    scores : (P, 4 + K + S) array
+        Where each picture alone would move them: the gradient of half the cost. Their sum is 0 at the optimum.
     """
 
     kind: LensKind
     lens: Floats
     R: Floats
     t: Floats
+    shape: Floats
     residuals: Floats
     cost: float
     information: Floats
+    scores: Floats
 
 
 def camera_model(kind: LensKind, lens: Floats, size: tuple[int, int], name: str = "camera") -> CameraModel:
@@ -144,10 +152,15 @@ def fit_lens(kind: LensKind, views: Sequence[View], size: tuple[int, int]) -> Le
     return best
 
 
-def pose_views(fit: LensFit, views: Sequence[View], size: tuple[int, int]) -> LensFit | None:
-    """Poses of other pictures under the lens of a fit, which is held; None if the lens does not reach their corners."""
+def pose_views(
+    fit: LensFit, views: Sequence[View], size: tuple[int, int], board: BoardShape | None = None
+) -> LensFit | None:
+    """Poses of other pictures under the lens and the shape of a fit, which are held.
+
+    None if the lens does not reach their corners.
+    """
     start = _posed(fit.kind, fit.lens, views, size)
-    return None if start is None else refine(start, views, size, hold_lens=True)
+    return None if start is None else refine(replace(start, shape=fit.shape), views, size, True, board)
 
 
 def without(fit: LensFit, keep: Sequence[int]) -> LensFit:
@@ -155,7 +168,19 @@ def without(fit: LensFit, keep: Sequence[int]) -> LensFit:
     return replace(fit, R=fit.R[list(keep)], t=fit.t[list(keep)])
 
 
-def refine(start: LensFit, views: Sequence[View], size: tuple[int, int], hold_lens: bool = False) -> LensFit:
+def bent(fit: LensFit, board: BoardShape) -> LensFit:
+    """The fit of a flat board as the start of one whose shape is fitted, too."""
+    return replace(fit, shape=np.zeros(len(board)))
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of a trial step that leaves where the model holds: it is not taken
+def refine(
+    start: LensFit,
+    views: Sequence[View],
+    size: tuple[int, int],
+    hold_lens: bool = False,
+    board: BoardShape | None = None,
+) -> LensFit:
     """Minimise the sum of squared reprojection errors from a start, whose cost need not be known.
 
     Parameters
@@ -166,48 +191,58 @@ def refine(start: LensFit, views: Sequence[View], size: tuple[int, int], hold_le
     size : (width, height)
     hold_lens : bool
         Fit the poses alone.
+    board : BoardShape or None
+        Needed if the start has a shape.
     """
-    lens, R, t = start.lens, start.R, start.t
-    points, pixels = np.concatenate([v.points for v in views]), np.concatenate([v.pixels for v in views])
+    lens, R, t, shape = start.lens, start.R, start.t, start.shape
+    flat, pixels = np.concatenate([v.points for v in views]), np.concatenate([v.pixels for v in views])
     counts = [len(view.points) for view in views]
     of = np.repeat(np.arange(len(views)), counts)
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    free = 0 if hold_lens else len(lens)
+    modes = np.zeros((len(flat), 3, 0)) if board is None or not len(shape) else board.modes(flat)
+    points = flat + modes @ shape
+    free, own = (0, 0) if hold_lens else (len(lens), len(lens) + len(shape))
     residuals = _residuals(start.kind, lens, R, t, points, pixels, of, size)
     cost = float(np.sum(residuals**2))
     damping = 1e-3
-    A, B, C = np.zeros((free, free)), np.zeros((len(views), free, 6)), np.zeros((len(views), 6, 6))
+    A, a = np.zeros((len(views), own, own)), np.zeros((len(views), own))
+    B, C = np.zeros((len(views), own, 6)), np.zeros((len(views), 6, 6))
     for _ in range(STEPS):
         turned = (R[of] @ points[:, :, None])[:, :, 0]
         X = turned + t[of]
         _, by_point, _ = Camera(camera_model(start.kind, lens, size)).project_jacobian(X)
         by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=2)
         by_lens = lens_jacobian(start.kind, lens, X)[:, :, :free]
-        A = np.tensordot(by_lens, by_lens, axes=([0, 1], [0, 1]))
+        if own > free:
+            by_lens = np.concatenate([by_lens, by_point @ (R[of] @ modes)], axis=2)
+        A = np.add.reduceat(by_lens.transpose(0, 2, 1) @ by_lens, first)
         B = np.add.reduceat(by_lens.transpose(0, 2, 1) @ by_pose, first)
         C = np.add.reduceat(by_pose.transpose(0, 2, 1) @ by_pose, first)
-        a = np.tensordot(by_lens, residuals, axes=([0, 1], [0, 1]))
+        a = np.add.reduceat((by_lens.transpose(0, 2, 1) @ residuals[:, :, None])[:, :, 0], first)
         c = np.add.reduceat((by_pose.transpose(0, 2, 1) @ residuals[:, :, None])[:, :, 0], first)
         before, refused = cost, False
         while damping < MOST_DAMPING:
-            step, steps = _solve(A, B, C, a, c, damping)
-            if not float(a @ step) + float(np.sum(c * steps)) > SETTLED * cost:
+            step, steps = _solve(A.sum(axis=0), B, C, a.sum(axis=0), c, damping)
+            if not float(a.sum(axis=0) @ step) + float(np.sum(c * steps)) > SETTLED * cost:
                 damping = np.inf
                 break
-            trial = lens.copy()
-            trial[:free] -= step
-            new_R, new_t = rotation_matrix(-steps[:, :3]) @ R, t - steps[:, 3:]
-            there = _residuals(start.kind, trial, new_R, new_t, points, pixels, of, size)
+            trial, bend = lens.copy(), shape.copy()
+            trial[:free] -= step[:free]
+            bend[: own - free] -= step[free:]
+            new_R, new_t, at = rotation_matrix(-steps[:, :3]) @ R, t - steps[:, 3:], flat + modes @ bend
+            there = _residuals(start.kind, trial, new_R, new_t, at, pixels, of, size)
             now = float(np.sum(there**2))
             if now <= cost:  # false for NaN: the trial folds the lens over a corner
-                lens, R, t, residuals, cost = trial, new_R, new_t, there, now
+                lens, R, t, residuals, cost, shape, points = trial, new_R, new_t, there, now, bend, at
                 damping = damping if refused else max(0.1 * damping, 1e-6)
                 break
             damping, refused = 8.0 * damping, True
         if not before - cost > SETTLED * before:
             break
-    information = A - np.sum(B @ np.linalg.pinv(C, hermitian=True) @ B.transpose(0, 2, 1), axis=0)
-    return LensFit(start.kind, lens, R, t, residuals, cost, information)
+    along = B @ np.linalg.pinv(C, hermitian=True)
+    information = A - along @ B.transpose(0, 2, 1)
+    scores = a - (along @ c[:, :, None])[:, :, 0]
+    return LensFit(start.kind, lens, R, t, shape, residuals, cost, information, scores)
 
 
 def _residuals(
@@ -270,4 +305,6 @@ def _posed(kind: LensKind, lens: Floats, views: Sequence[View], size: tuple[int,
     poses = [ways[way][k] for k, way in enumerate(better)]
     together = np.concatenate([part[:, way] for part, way in zip(parts, better, strict=True)])
     R, t = np.array([pose[0] for pose in poses]), np.array([pose[1] for pose in poses])
-    return LensFit(kind, lens, R, t, together, float(costs.min(axis=1).sum()), np.zeros((0, 0)))
+    nothing = np.zeros((len(views), 0))
+    cost = float(costs.min(axis=1).sum())
+    return LensFit(kind, lens, R, t, np.zeros(0), together, cost, nothing[:, :, None], nothing)

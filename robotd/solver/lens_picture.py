@@ -27,13 +27,14 @@ def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -
 
     name = plain(result.camera.name)
     figure.text(0.05, 0.94, f"Lens of {name}: {result.kind}, {result.rms_px:.3f} px rms", size=15, color=INK)
-    held = ", ".join(f"{kind} {error:.3f} px" for kind, error in result.held_out_px.items())
-    figure.text(0.05, 0.90, f"held out: {held}", size=9.5, color=MUTED)
+    lines = (f"held out, px rms: {result.held_out_words}", *result.doubts)
+    for row, line in enumerate(lines):
+        figure.text(0.05, 0.915 - 0.024 * row, line, size=9, color=MUTED)
 
     width, height = result.camera.size
     centre = result.camera.matrix[2:]
     seen, left = np.concatenate([view.pixels for view in views]), np.concatenate(result.residuals)
-    over = figure.add_axes((0.05, 0.08, 0.5, 0.78))
+    over = figure.add_axes((0.05, 0.08, 0.5, 0.73))
     arrows = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / MAGNIFIED, "color": ARROW}
     over.quiver(*seen.T, *left.T, width=0.0012, headwidth=3, **arrows)
     over.add_patch(Circle(centre, result.reach_px, fill=False, color=RING, linewidth=1.6))
@@ -42,7 +43,7 @@ def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -
     over.set_title(f"residuals x {MAGNIFIED:.0f}; green: the lens holds inside", size=10, color=INK)
 
     most = 1.1 * max(float(np.abs(left).max()), 0.1)
-    scatter = figure.add_axes((0.62, 0.5, 0.2, 0.36))
+    scatter = figure.add_axes((0.62, 0.48, 0.2, 0.33))
     scatter.plot(*left.T, ".", color=ARROW, markersize=2.5)
     scatter.add_patch(Circle((0.0, 0.0), 2.0 * result.rms_px, fill=False, color=MUTED))
     scatter.set(xlim=(-most, most), ylim=(most, -most), aspect="equal", xlabel="du (px)", ylabel="dv (px)")
