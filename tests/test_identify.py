@@ -11,6 +11,7 @@ from robotd.identify.code import code_words, largest_prime, on_off_words
 from robotd.identify.decoder import Evidence, Posterior, Prior, decode
 from robotd.identify.delays import DelayModel, turns
 from robotd.identify.inquiry import Candidates, Inquiry, requests
+from robotd.identify.pace import Pace
 from tests.label_bench import coded_stops
 
 CONFIG = IdentifyConfig()
@@ -327,6 +328,44 @@ def test_an_audit_goes_with_a_slot_that_is_needed_anyway():
 
 def test_a_stop_too_short_for_names_asks_a_few_labels_all_the_same():
     assert 1 <= len(inquire(50, IdentifyConfig(stop_s=10.0)).next_question(None, 0.0).labels) < 50
+
+
+def test_labels_that_hardly_show_are_asked_along_with_known_ones():
+    weights = np.where(np.arange(29) < 19, 0.9, 0.003)
+    known = np.ones(29, bool)
+    question = inquire(29, weights=weights, expected=np.arange(29) < 19, known=known).next_question(None, 0.0)
+    assert sorted(question.labels) == list(range(29))  # a second's worth of commands
+
+
+def test_the_more_lights_may_show_the_longer_their_names_take():
+    pace = Pace(DelayModel(CONFIG))
+    for weight in (0.003, 0.05, 0.5):
+        seconds = [pace.seconds(5, others, weight * others) for others in (1, 5, 20, 60, 200, 1000)]
+        assert (np.diff(seconds) > -0.08 * np.array(seconds[1:])).all()  # but for alphabets that fit by chance
+        assert seconds[-1] > 3.0 * seconds[0]
+    assert pace.seconds(25, 15, 0.05) < pace.seconds(25, 0, 0.0) + 8.0
+    assert pace.affordable(25, np.full(15, 0.003), 60.0) == 15
+
+
+def test_labels_that_are_sought_are_asked_again_when_they_were_silent():
+    sought = np.arange(6) >= 4
+    inquiry = inquire(6, expected=np.arange(6) < 3, known=np.ones(6, bool), sought=sought, weights=np.full(6, 0.4))
+    inquiry.next_question(None, 0.0)
+    answer(inquiry, 0.0)
+    assert {4, 5} <= set(inquiry.next_question(doubt([[1, 2]]), 20.0).labels.tolist())
+
+
+def test_a_light_that_may_be_foreign_is_asked_along_with_others_but_is_not_worth_a_slot():
+    lists = [(np.array([3, 17]), np.array([0.5, 0.5])), (np.array([9]), np.array([0.2]))]
+    for chosen, expected in ((slice(0, 2), {3, 17, 9}), (slice(1, 2), set())):
+        inquiry = inquire(29, known=np.arange(29) == 0)
+        inquiry.next_question(None, 0.0)
+        answer(inquiry, 0.0, lights=len(lists[chosen]))
+        found = Posterior(np.array([3, 9]), np.array([0.5, 0.2]), np.array([0.0, 0.8]), lists)
+        found = Posterior(found.label[chosen], found.probability[chosen], found.none[chosen], lists[chosen])
+        again = inquiry.next_question(found, 20.0)
+        assert (set() if again is None else set(again.labels.tolist())) >= expected
+        assert expected or again is None
 
 
 def test_one_at_a_time_asks_one_label_a_slot():

@@ -10,7 +10,7 @@ from robotd.geometry.transforms import invert_rigid, pose_matrix, transform_poin
 from robotd.identify.alignment import align
 from robotd.identify.decoder import Prior, decode
 from robotd.identify.delays import DelayModel
-from robotd.identify.inquiry import Candidates
+from robotd.identify.inquiry import Candidates, Inquiry
 from robotd.identify.memory import LabelMemory
 from robotd.identify.settings import IdentifyConfig
 from robotd.records import Pose, Sighting
@@ -60,12 +60,13 @@ def test_no_wrong_throughput_is_believed_that_a_dozen_lights_fit_by_accident():
 
 
 def test_labels_seen_before_are_named_by_their_place_in_a_short_stop():
-    survey = store(3, EIGHT, number=160, stops=9, given=8)
-    assert len(survey.per_stop) == 1
-    assert survey.wrong == 0
-    assert survey.right >= 20
-    assert survey.undecided <= 2
-    assert survey.per_stop[0] <= 60.0
+    surveys = [store(seed, EIGHT, number=110, stops=7, given=6) for seed in (3, 4, 5)]
+    for survey in surveys:
+        assert len(survey.per_stop) == 1
+        assert survey.wrong == 0
+        assert survey.right >= 20
+        assert survey.undecided <= 2
+    assert np.mean([survey.per_stop[0] for survey in surveys]) <= 60.0
 
 
 def test_the_decoder_takes_ten_thousand_labels_in_bounded_memory():
@@ -135,6 +136,51 @@ def test_a_label_seen_once_is_expected_along_its_ray():
     _, seen, prior = predict(memory, Pose(0.4, 0.0, 0.0), 0.4)
     light = next(k for k, sighting in enumerate(seen) if sighting.label == "near")
     assert prior.ratios[light][list(prior.near).index(0)] > 0.5
+
+
+def asked_first(memory, pose, travelled):
+    candidates = memory.candidates(pose, travelled, [camera.name for camera in rig()])
+    question = Inquiry(candidates, EIGHT, DelayModel(EIGHT)).next_question(None, 0.0)
+    return {list(memory.index)[label] for label in question.labels}
+
+
+def test_a_label_seen_from_one_stop_is_asked_at_all_that_follow_until_its_place_is_known():
+    others = [f"L{k}" for k in range(40)]  # placed, and more than may be asked although they hardly show
+    memory = LabelMemory(["once", *others], rig(), EIGHT)
+    names = [camera.name for camera in rig()]
+    for stop in range(2):
+        memory.candidates(Pose(0.3 * stop, 0.0, 0.0), 0.3 * stop, names)
+        lights = [Sighting("left", label, 20.0 + 15.0 * k - 60.0 * stop, 240.0) for k, label in enumerate(others)]
+        far = [Sighting("front", "once", 330.0, 235.0)][stop:]
+        memory.record(Pose(0.3 * stop, 0.0, 0.0), 0.3 * stop, [*lights, *far], np.ones(41, bool))
+    for stop in range(2, 8):  # round corners, and on where it was taken to be behind the robot
+        pose = Pose(0.9 * stop, 0.1 * stop, 0.8 * stop)
+        assert "once" in asked_first(memory, pose, 0.9 * stop)
+        memory.record(pose, 0.9 * stop, [], np.arange(41) == 0)
+
+
+def test_a_place_that_shows_nothing_is_doubted_until_the_label_is_seen_from_a_third_stop():
+    memory = remembered(Pose(0.0, 0.0, 0.0), Pose(0.5, 0.0, 0.1))
+    names = [camera.name for camera in rig()]
+    sought = []
+    for travelled in (1.0, 1.1, 1.2):
+        sought.append(bool(memory.candidates(Pose(1.0, 0.0, 0.0), travelled, names).sought[0]))
+        memory.record(Pose(1.0, 0.0, 0.0), travelled, [], np.ones(4, bool))
+    assert sought == [False, False, True]
+    pose = Pose(0.8, 0.0, 0.0)
+    memory.candidates(pose, 1.4, names)
+    memory.record(pose, 1.4, sightings_from(pose), np.ones(4, bool))
+    assert not memory.candidates(Pose(1.0, 0.0, 0.0), 1.6, names).sought[0]
+
+
+def test_a_label_seen_once_may_be_at_the_far_end_of_a_hall():
+    memory = LabelMemory(LABELS, rig(), EIGHT)
+    names = [camera.name for camera in rig()]
+    memory.candidates(Pose(0.0, 0.0, 0.0), 0.0, names)
+    memory.record(Pose(0.0, 0.0, 0.0), 0.0, [Sighting("front", "near", 319.5, 239.5)], np.ones(4, bool))  # 6.5 m ahead
+    candidates = memory.candidates(Pose(5.0, 1.0, 0.0), 5.2, names)
+    prior = memory.prior(candidates, ["front"], np.array([[319.5 + 268.5 * 1.0 / 1.5, 239.5]]))
+    assert prior.ratios[0][list(prior.near).index(0)] > -0.5
 
 
 def test_after_an_interruption_of_odometry_no_place_is_known():

@@ -31,10 +31,13 @@ FIRST_LIGHTS = 60.0  # labels that a stop shows of which nothing is known
 SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput is not known,
 SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
+FEW_LIGHTS = 3.0  # that a stop may name; where it has no time for more, it asks what it can
 SINGLES = 3  # slots for each label when they are asked one at a time
 ENOUGH_OWED = 0.4  # of the known labels: when the audit owes so many, it gets a slot of its own
 REFLECTED = 0.3  # probability of labels without a light here, below which a light is a reflection not worth a slot
 STILL_THERE = 0.1  # probability from which a label that did not answer is asked again
+FOREIGN = 0.95  # probability from which a light is no label of ours, and nothing is asked for it
+STILL_SOUGHT = 0.02  # the same of one that was never seen, or whose place is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +48,8 @@ class Candidates:
     known. `wanted` false: nobody would learn anything from its flash. `asked` how often it was asked at other stops:
     when there is no time for all, the ones least asked come first. `rivals` per expected label the labels whose
     predicted image positions are near enough to be confused with it, itself among them. `owed` labels that the audit
-    should have asked at earlier stops. `known` those that have been seen.
+    should have asked at earlier stops. `known` those that have been seen, `sought` those of them whose places need
+    another view: they are asked wherever they may show.
     """
 
     weights: Floats
@@ -55,13 +59,14 @@ class Candidates:
     rivals: dict[int, Numbers] = field(default_factory=dict)
     owed: float = 0.0
     known: Flags = field(default_factory=lambda: np.zeros(0, bool))
+    sought: Flags = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod
     def anything(cls, labels: int) -> Candidates:
         """Nothing is known: every label may be visible."""
         flags = np.ones(labels, bool)
         weights = np.full(labels, min(1.0, FIRST_LIGHTS / max(labels, 1)))
-        return cls(weights, ~flags, flags, np.zeros(labels, np.intp), known=~flags)
+        return cls(weights, ~flags, flags, np.zeros(labels, np.intp), known=~flags, sought=~flags)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +99,7 @@ class Inquiry:
         self._begun = self._started = math.nan
         self._gates: Floats = np.zeros(0)
         self._pending: Flags = np.zeros(0, bool)  # lights that the present question is about
+        self._besides = False  # it is also about labels whose lights have not been seen, or are checked
         self._words = self._code() if config.scheme == "code" else None
 
     # ---- what to ask -------------------------------------------------------------------------------------------------
@@ -165,12 +171,14 @@ class Inquiry:
     def _first(self) -> Question | None:
         """Everything that may be visible, as far as time allows; what is known to be in view goes first."""
         candidates, config = self.candidates, self.config
-        known = self._rng.permutation(np.flatnonzero(candidates.wanted & candidates.expected))
-        others = self._rng.permutation(np.flatnonzero(self._worth_asking() & ~candidates.expected))
+        first = candidates.expected | candidates.sought
+        known = self._rng.permutation(np.flatnonzero(candidates.wanted & first))
+        others = self._rng.permutation(np.flatnonzero(self._worth_asking() & ~first))
         others = others[np.argsort(candidates.asked[others], kind="stable")]
         most = self.pace.affordable(len(known), candidates.weights[others], config.stop_s)
-        if not most and not len(known):  # too short a time for names; what can be asked at all may be named later
-            most = max(1, int(0.5 * (config.stop_s - self.pace.overhead) / self.delays.interval))
+        few = float(candidates.weights[others[:most]].sum()) < FEW_LIGHTS
+        if few and not len(known):  # too short a time for names; what can be asked at all may be named later
+            most = max(most, 1, int(0.5 * (config.stop_s - self.pace.overhead) / self.delays.interval))
         others = others[:most]
         if not len(known) + len(others):
             return None
@@ -185,9 +193,11 @@ class Inquiry:
         """Every candidate of every light that is undecided, known labels that did not answer, and the audit."""
         config, candidates = self.config, self.candidates
         number = len(self.evidence) - (TRIES if len(config.durations_s) >= 4 else MORE_TRIES)
-        undecided = np.flatnonzero(
-            posterior.open(config.min_probability) & (self._found(len(posterior.label)) > number)
-        )
+        foreign = (
+            FOREIGN if candidates.known.any() else 0.5
+        )  # at a first stop there are many lights, and they come again
+        doubted = (posterior.probability < config.min_probability) & (posterior.none < foreign)
+        undecided = np.flatnonzero(doubted & (self._found(len(posterior.label)) > number))
         named = np.flatnonzero(posterior.decided(config.min_probability) & (posterior.none < 0.5))
         seen = np.zeros(len(candidates.weights), bool)
         seen[posterior.label[named]] = True
@@ -201,7 +211,7 @@ class Inquiry:
             owed = candidates.owed + config.audit_fraction * len(known)
             if worth or owed >= ENOUGH_OWED * len(known) > 0.0:
                 self.audited = audit = np.sort(self._rng.permutation(known)[: int(owed)])
-            silent = self._still_there(np.setdiff1d(known, posterior.label[named]))
+            silent = self._still_there(seen)
         left = (self._started + config.stop_s - t - self.pace.overhead) / self.delays.interval
         if not worth and not len(audit):
             return None
@@ -212,6 +222,7 @@ class Inquiry:
             lists.append((labels[kept], odds[kept]))
         value = self.pace.cover(lists, len(candidates.weights), len(audit) + len(silent))
         value[audit] = value[silent] = 1.0
+        self._besides = bool(len(audit) + len(silent))
         ask = np.flatnonzero(value)
         ask = ask[np.argsort(-value[ask], kind="stable")][: max(0, int(left))]
         if not len(ask):
@@ -219,11 +230,21 @@ class Inquiry:
         doubt = (1.0 - posterior.probability[undecided]) / np.maximum(posterior.probability[undecided], 1e-9)
         return self._compose(ask, ask[:0], lists, float(np.median(doubt)) if len(doubt) else 0.0)
 
-    def _still_there(self, silent: Numbers) -> Numbers:
-        """Those of the labels without an answer that are in view rather than hidden, though their flashes were lost."""
-        shows = np.clip(self.candidates.weights[silent], 0.0, 0.95)
+    def _still_there(self, seen: Flags) -> Numbers:
+        """Labels without an answer that may be in view rather than hidden, though their flashes were lost.
+
+        Of those without a place so many show as answered at once; each further view of them is worth more.
+        """
+        candidates = self.candidates
+        lacking = self.asked & (~candidates.known | candidates.sought)
+        shows = np.clip(candidates.weights, 0.0, 0.95)
+        new = self.asked & ~candidates.known
+        shows[new] = min(0.95, float((seen & new).sum()) / max(1.0, float(new.sum())))
         lost = self.config.lost_fraction * shows
-        return silent[lost >= STILL_THERE * (lost + 1.0 - shows)]
+        least = np.where(lacking, STILL_SOUGHT, STILL_THERE)
+        return np.flatnonzero(
+            self.asked & (candidates.expected | lacking) & ~seen & (lost >= least * (lost + 1.0 - shows))
+        )
 
     def _found(self, lights: int) -> Numbers:
         """The slot (N,), counted from 1, in which each light was found."""
@@ -326,7 +347,7 @@ class Inquiry:
         pending = self._pending
         about = np.zeros(0, bool) if not len(pending) else flashed[: len(pending)][pending]
         sent = t >= fetched + float(self._question.times[-1])  # what still waits would delay the next question
-        if sent and len(about) and about.all() and not self.candidates.expected.any():
+        if sent and len(about) and about.all() and not self._besides:
             return True
         if self.config.scheme == "one at a time" and flashed.any():
             return True

@@ -32,30 +32,59 @@ FARTHEST_M = 8.0
 RAYS_KEPT = 6  # newest of each label
 POINTS = np.array([-1.8, -1.2, -0.6, 0.0, 0.6, 1.2, 1.8])  # along the least known direction, in standard deviations
 POINT_WEIGHTS = np.exp(-0.5 * POINTS**2) / np.exp(-0.5 * POINTS**2).sum()
+DEPTHS = np.geomspace(0.5, FARTHEST_M, len(POINTS))  # m along the ray of a label that was seen from one stop only
+DEPTH_WEIGHTS = np.exp(-0.5 * (np.log(DEPTHS / 1.8) / 0.8) ** 2)  # as near as shelves are, or far behind them
+DEPTH_WEIGHTS /= DEPTH_WEIGHTS.sum()
 SHOWS = 0.9  # probability that a label which is predicted to be in view can be seen
 FORGETS = 0.6  # factor of that for each time in a row that it could not
 ELSEWHERE = 0.003  # the same of a label whose place is known and out of view
+HIDDEN = 0.02  # the same of one that is near and turned away or behind something
+ANYWHERE = 0.05  # the same of one that is near and not placed: it may be anywhere
+PLACED = 0.2  # of its distance to which a label's place must be known; and it must have been seen from two stops,
+MISSED, STOPS = 2, 3  # or, if it was missed so often in a row, from so many: what was seen may have been a reflection
 UNLIKELY_S = 1.5  # spent on labels that are known and probably not in view
 EXPECTED = 0.3  # from which on a label is asked as one that is in view
 NEW_LIGHTS = 10.0  # labels never seen before that a stop shows, unless it is the first one
 REACH = 1.25  # times the distance within which 95 % of the sightings lie: further labels do not show
-NARROW = 0.35  # cosine of the angle between two directions to a label from which on it may not show from the second
-RARELY = 0.15  # probability that such a label shows
+OBLIQUE = 1.3  # rad from its axis up to which a label shows
+SPREAD_LEFT = 0.25  # rad by which its axis is not known at least, however many directions it was seen from
+RARELY = 0.15  # probability that a label shows which is too far away, or is turned away
+COARSE, WIDER = 0.1, 4.0  # fraction of predictions whose error is so many times larger
 MISPREDICTED = 0.05  # of lights are not where they were predicted: reflections, wrong names, slips
+ASTRAY = 0.3  # the same of labels that are not placed: what was seen of them may have been a reflection
 GATE = 3.0  # standard deviations within which two predictions may be mistaken for one another
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Prediction:
     """Image positions of the labels `labels` (M,): per camera, label and point, with weights that sum to the label's
-    probability of being in that camera's view. `distances` (M,) in metres; `sure` where that is known to a fifth."""
+    probability of being in that camera's view. `distances` (M,) in metres; `sure` where that is known to a fifth.
+    `placed` labels need no further view."""
 
     labels: Numbers
     distances: Floats
     sure: NDArray[np.bool_]
+    placed: NDArray[np.bool_]
     pixels: Floats  # (C, M, P, 2)
     weights: Floats  # (C, M, P)
     sigmas: Floats  # (C, M, P)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Labels (M,) that were seen: `points` (M, 3) with `covariances` (M, 3, 3), from how many `stops`, their newest ray
+    (`origin`, `along` (M, 3)) and the heading's `doubt` there. They face `facing` (M, 3), seen from directions up to
+    `around` (M,) radians about it."""
+
+    labels: Numbers
+    points: Floats
+    covariances: Floats
+    stops: Numbers
+    origin: Floats
+    along: Floats
+    doubt: Floats
+    facing: Floats
+    around: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,21 +188,29 @@ class LabelMemory:
         self._stand = self._arrived(pose, travelled)
         self._prediction = prediction = self._predict(self._stand)
         share = prediction.weights.sum(axis=(0, 2))
-        weights[prediction.labels] = np.maximum(SHOWS * FORGETS ** self._missed[prediction.labels] * share, ELSEWHERE)
+        sought = np.zeros(total, bool)
+        sought[prediction.labels] = ~prediction.placed
+        least = np.where(prediction.placed, HIDDEN, ANYWHERE)
+        weights[prediction.labels] = np.maximum(SHOWS * FORGETS ** self._missed[prediction.labels] * share, least)
         self._expected = ~unseen & (weights >= EXPECTED * SHOWS)
-        wanted = unseen | self._expected
+        wanted = unseen | self._expected | sought
         unlikely = np.flatnonzero(~wanted)
         few = round(UNLIKELY_S * self.config.commands_per_s)
-        once = np.array([len({ray[2] for ray in self._rays[int(label)]}) == 1 for label in unlikely], bool)
-        doubtful = np.lexsort((self.asked[unlikely], ~once, -weights[unlikely]))  # a wrong name is seen but once
-        wanted[unlikely[doubtful[:few]]] = True
+        wanted[unlikely[np.lexsort((self.asked[unlikely], -weights[unlikely]))[:few]]] = True
         for labels, begin, end in self._zones:
             if not begin <= travelled <= end:
                 wanted[labels] = False
                 weights[labels] = 0.0
         wanted[[self.index[label] for label in self.learnt | self.refused]] = False
         return Candidates(
-            weights, self._expected & wanted, wanted, self.asked.copy(), self._rivals(), self.owed, ~unseen
+            weights,
+            self._expected & wanted,
+            wanted,
+            self.asked.copy(),
+            self._rivals(),
+            self.owed,
+            ~unseen,
+            sought & wanted,
         )
 
     def prior(self, candidates: Candidates, cameras: Sequence[str], pixels: Floats) -> Prior:
@@ -185,11 +222,13 @@ class LabelMemory:
         area = np.array([float(np.prod(camera.size)) for camera in self._cameras])
         inside = np.maximum(prediction.weights.sum(axis=(0, 2)), 1e-6)
         ratios = np.empty((len(pixels), len(prediction.labels)))
+        astray = np.where(prediction.placed, MISPREDICTED, ASTRAY)
         for light, camera in enumerate(number):
             sigma = prediction.sigmas[camera]
             squares = ((prediction.pixels[camera] - pixels[light]) ** 2).sum(axis=2) / sigma**2
-            density = (prediction.weights[camera] * np.exp(-0.5 * squares) / (2.0 * np.pi * sigma**2)).sum(axis=1)
-            ratios[light] = (1.0 - MISPREDICTED) * density / inside * area.sum() + MISPREDICTED
+            shape = (1.0 - COARSE) * np.exp(-0.5 * squares) + COARSE / WIDER**2 * np.exp(-0.5 * squares / WIDER**2)
+            density = (prediction.weights[camera] * shape / (2.0 * np.pi * sigma**2)).sum(axis=1)
+            ratios[light] = (1.0 - astray) * density / inside * area.sum() + astray
         return Prior(candidates.weights, prediction.labels, np.log(ratios))
 
     def align(self, cameras: Sequence[str], pixels: Floats, labels: Numbers) -> bool:
@@ -200,8 +239,8 @@ class LabelMemory:
         bool
             Whether the predictions that `prior` goes by have changed.
         """
-        names, points, covariances, _, _ = self._points()
-        row = {int(label): k for k, label in enumerate(names)}
+        known = self._seen()
+        row = {int(label): k for k, label in enumerate(known.labels)}
         here = np.array([k for k, label in enumerate(labels) if int(label) in row], np.intp)
         rows = np.array([row[int(labels[k])] for k in here], np.intp)
         start = self._arrived(self._stand.pose, self._stand.travelled)
@@ -209,8 +248,8 @@ class LabelMemory:
             self._cameras,
             np.array([self._number[cameras[k]] for k in here], np.intp),
             pixels[here],
-            points[rows],
-            covariances[rows],
+            known.points[rows],
+            known.covariances[rows],
             start.T_memory_robot,
             math.sqrt(start.doubt - self._last.doubt + RAY_NOISE**2),
             math.hypot(self.config.prediction_px, RAY_NOISE * self._focal),
@@ -273,9 +312,8 @@ class LabelMemory:
         doubt = self._last.doubt + HEADING_NOISE**2 * driven
         return _Stand(pose, travelled, pose_matrix(x, y, heading), doubt)
 
-    def _points(self) -> tuple[Numbers, Floats, Floats, Floats, Floats]:
-        """Seen labels (M,), positions (M, 3) with covariances (M, 3, 3), doubt of the heading when they were seen last,
-        directions seen from (M, 3)."""
+    def _seen(self) -> _Seen:
+        """Where the labels are that have been seen, by least squares over their rays."""
         labels = np.array(list(self._rays), np.intp)
         owner = np.repeat(np.arange(len(labels)), [len(rays) for rays in self._rays.values()])
         rays = [ray for each in self._rays.values() for ray in each]
@@ -301,24 +339,43 @@ class LabelMemory:
             points = np.asarray(np.linalg.solve(information, right[:, :, None])[:, :, 0])
         facing = np.zeros((len(labels), 3))
         np.add.at(facing, owner, -along)
-        facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
-        return labels, points, np.asarray(np.linalg.inv(information)), np.asarray(doubt[newest]), facing
+        length = np.linalg.norm(facing, axis=1)
+        mean = length / np.maximum(np.bincount(owner, minlength=len(labels)), 1)  # sin(a) / a, about, if even up to a
+        return _Seen(
+            labels,
+            points,
+            np.asarray(np.linalg.inv(information)),
+            np.array([len({ray[2] for ray in each}) for each in self._rays.values()], np.intp),
+            origin[newest],
+            along[newest],
+            doubt[newest],
+            facing / np.maximum(length, 1e-9)[:, None],
+            np.sqrt(6.0 * np.maximum(1.0 - mean, 0.0)),
+        )
 
     def _predict(self, stand: _Stand) -> _Prediction:
-        labels, points, covariances, doubt, facing = self._points()
+        seen = self._seen()
         x, y = stand.T_memory_robot[:2, 3]
-        near = np.hypot(points[:, 0] - x, points[:, 1] - y) < FARTHEST_M
-        labels, points, covariances = labels[near], points[near], covariances[near]
-        heading, facing = np.sqrt(RAY_NOISE**2 + np.maximum(stand.doubt - doubt[near], 0.0)), facing[near]
-        variances, axes = np.linalg.eigh(covariances)
-        long = np.sqrt(variances[:, -1])[:, None, None] * axes[:, None, :, -1]
-        spread = points[:, None, :] + POINTS[None, :, None] * long  # (M, P, 3)
+        variances, axes = np.linalg.eigh(seen.covariances)
+        long = np.sqrt(variances[:, -1])
+        spread = seen.points[:, None] + POINTS[None, :, None] * (long[:, None] * axes[:, :, -1])[:, None]  # (M, P, 3)
+        share = np.tile(POINT_WEIGHTS, (len(spread), 1))
+        once = seen.stops < 2
+        spread[once] = seen.origin[once, None] + DEPTHS[None, :, None] * seen.along[once, None]
+        share[once] = DEPTH_WEIGHTS
+        enough = np.where(self._missed[seen.labels] < MISSED, 2, STOPS)
+        placed = (seen.stops >= enough) & (long < PLACED * np.linalg.norm(seen.points - seen.origin, axis=1))
+        near = np.flatnonzero(np.hypot(spread[:, :, 0] - x, spread[:, :, 1] - y).min(axis=1) < FARTHEST_M)
+        labels, spread, placed = seen.labels[near], spread[near], placed[near]
+        heading = np.sqrt(RAY_NOISE**2 + np.maximum(stand.doubt - seen.doubt[near], 0.0))
         away = np.array([x, y, self._height]) - spread
         distances = np.linalg.norm(away, axis=2)
         reach = REACH * float(np.quantile(self._distances, 0.95)) if len(self._distances) >= 20 else FARTHEST_M
-        shows = (distances <= reach) & ((facing[:, None, :] * away).sum(axis=2) >= NARROW * distances)
-        shares = np.where(shows, 1.0, RARELY) * POINT_WEIGHTS
-        sure = np.sqrt(variances[:, -1]) < 0.2 * distances.mean(axis=1)
+        cosine = (seen.facing[near, None] * away).sum(axis=2) / np.maximum(distances, 1e-9)
+        left = np.maximum(OBLIQUE - seen.around[near], SPREAD_LEFT)[:, None]  # about `facing` its axis may lie so far
+        turned = np.clip(0.5 + 0.5 * (OBLIQUE - np.arccos(np.clip(cosine, -1.0, 1.0))) / left, RARELY, 1.0)
+        shares = np.where(distances <= reach, turned, RARELY) * share[near]
+        sure = long[near] < 0.2 * distances.mean(axis=1)
         T_robot_world = invert_rigid(stand.T_memory_robot)
         shape = (len(self._cameras), len(labels), len(POINTS))
         pixels, weights, sigmas = np.full((*shape, 2), -1e6), np.zeros(shape), np.ones(shape)
@@ -334,7 +391,7 @@ class LabelMemory:
             pixels[number] = uv
             weights[number] = valid.reshape(shape[1:]) * shares
             sigmas[number] = np.sqrt(noise + np.minimum(0.5 * step, 60.0) ** 2)
-        return _Prediction(labels, distances.mean(axis=1), sure, pixels, weights, sigmas)
+        return _Prediction(labels, distances.mean(axis=1), sure, placed, pixels, weights, sigmas)
 
     def _rivals(self) -> dict[int, Numbers]:
         """For every expected label, those that its light could be taken for by its position."""

@@ -21,6 +21,7 @@ SEEN_AFTER = 2.5  # periods from a flash's start to the decision that it is one
 COVERS = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # parts of a light's candidates that a repeated question may put
 GROUPS = 12  # parts of a queue between which there are pauses, at most
 SPREAD = 2.0  # candidates that are asked again for one light, relative to the number that its doubt amounts to
+FEWEST = 4  # candidates of one light that is asked about again
 SILENT = 0.3  # of the lights do not answer: lost, missed, or another label than the likeliest ones
 EARLY = 0.4  # of a slot's overhead has passed when most of its lights have answered
 AT_EASE = 0.3  # of the doubt that a name may leave
@@ -84,12 +85,15 @@ class Pace:
         number = known + others
         first = self.doubt(number, float(max(others, 1)))
         total, before, doubt = first.seconds, 0.0, others / first.told
+        needed = -math.expm1(-lights)  # probability that any shows: only then is anything repeated
         while doubt > self._target:
             asked = lights * (1.0 + SPREAD * doubt + SILENT * SPREAD * before)
-            seconds, told = self._repeated(max(1, min(number, math.ceil(asked))), doubt)
-            total += seconds
+            seconds, told = self._repeated(min(number, max(FEWEST, math.ceil(asked))), doubt)
+            total += needed * seconds
             before, doubt = doubt, doubt / told
-        return total + self._repeated(max(1, round(SILENT * lights)), 1.0)[0]  # those that were silent too often
+        return (
+            total + needed * self._repeated(max(1, round(SILENT * lights)), 1.0)[0]
+        )  # those that were silent too often
 
     def _repeated(self, number: int, doubt: float) -> tuple[float, float]:
         """Seconds of a repeated question, which ends when its lights have answered, and what it tells apart."""
