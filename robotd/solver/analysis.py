@@ -16,16 +16,17 @@ from scipy.spatial import ConvexHull, QhullError
 
 from ..records import Floats, Map, Survey, Vector3
 from ..typed_json import many_records
-from .bundle import SQUARE, Adjustment
+from .bundle import SQUARE
+from .covariance import frame_covariance
+from .known_labels import SLIPPED
 from .mapping import to_map
 from .placement import segments
-from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Ints, Problem, State, anchors, build_problem
-from .robust import SLIPPED, Optimum, optimise
+from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Ints, Problem, anchors, build_problem
+from .robust import Optimum, optimise
 from .ties import unchecked
 
 JOINING = 3  # shared labels that join two parts of a survey, as in placement
 _LEVEL_M = 0.05  # a label is at camera height within this
-_MOST_COLUMNS = 6000  # of a dense inverse: 300 MB
 _OUTSIDE_M = 0.5
 _FREE_SCALE = 0.01  # relative standard deviation from which the size of the map counts as free
 _DOUBT = 1e-3  # probability of a larger chi-square by chance
@@ -133,7 +134,7 @@ def analyse(survey: Survey) -> tuple[Map, Analysis]:
         result = to_map(problem, optimum)
     before = _before(problem)
     state, adjustment = optimum.state, optimum.adjustment
-    frame = _frame_covariance(adjustment, state)
+    frame = frame_covariance(adjustment, state)
     sensors = _sensors(optimum, frame)
     scale, heading = _shape(optimum, frame)
     # stated sigmas of sightings were replaced by estimates where residuals contradict them: only the rest is a test
@@ -260,22 +261,6 @@ def _outside(others: Floats, point: Floats) -> float:
     except (QhullError, ValueError):
         return 0.0
     return float(np.max(hull.equations[:, :2] @ point + hull.equations[:, 2]))
-
-
-def _frame_covariance(adjustment: Adjustment, state: State) -> Floats | None:
-    """Covariance (F, F) of all frame entries, zero for those held fixed; None if it would be too large."""
-    if not 0 < adjustment.size <= _MOST_COLUMNS:
-        return None
-    normal = adjustment.normal(adjustment.linearise(state, SQUARE), state, SQUARE)
-    S, *_ = adjustment.eliminate(normal)
-    try:
-        inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S)))
-    except np.linalg.LinAlgError:
-        return None
-    free = np.flatnonzero(adjustment.problem.free)
-    full = np.zeros((len(adjustment.columns), len(adjustment.columns)))
-    full[np.ix_(free, free)] = inner
-    return full
 
 
 def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:

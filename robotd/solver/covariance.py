@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 from ..records import Floats
 from .bundle import SQUARE, Adjustment
 from .problem import State
 
+_MOST_COLUMNS = 6000  # of a dense inverse: 300 MB
 _MOST_ENTRIES = 20_000_000  # of one dense temporary array: 160 MB
 
 
@@ -70,6 +72,22 @@ def covariance_reference(adjustment: Adjustment, state: State) -> Covariance:
         + np.einsum("nri,nij,nrj->n", B, points[adjustment.point], B, optimize=True)
     )
     return Covariance(0.5 * (points + points.transpose(0, 2, 1)), stops, np.clip(leverage, 0.0, 2.0))
+
+
+def frame_covariance(adjustment: Adjustment, state: State) -> Floats | None:
+    """Covariance (F, F) of all frame entries, zero for those held fixed; None if it would be too large."""
+    if not 0 < adjustment.size <= _MOST_COLUMNS:
+        return None
+    normal = adjustment.normal(adjustment.linearise(state, SQUARE), state, SQUARE)
+    S, *_ = adjustment.eliminate(normal)
+    try:
+        inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S)))
+    except np.linalg.LinAlgError:
+        return None
+    free = np.flatnonzero(adjustment.problem.free)
+    full = np.zeros((len(adjustment.columns), len(adjustment.columns)))
+    full[np.ix_(free, free)] = inner
+    return full
 
 
 def inverse(S: Floats) -> Floats:

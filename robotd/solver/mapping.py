@@ -28,6 +28,7 @@ from ..sighting_columns import made
 from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
 from .initial import world_rays
+from .known_labels import on_a_line
 from .linear import solve_linear
 from .misfit import FITS, FITS_NOT, Misfit, is_below_floor, misfit, strained
 from .problem import Bools, Problem, Sightings, State, build_problem, stops_per_label
@@ -106,6 +107,8 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
         )
     if doubt.text is not None:
         notes.append(doubt.text)
+    if (caution := on_a_line(problem)) is not None:
+        notes.append(caution)
     notes += strained(optimum)
     if optimum.rival is not None and tally.elsewhere.any():
         notes.append(_two_ways(problem, optimum.rival, tally.elsewhere, state))

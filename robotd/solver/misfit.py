@@ -1,38 +1,47 @@
 """Surveys that hardly fit: which mistake of who wrote them would explain it.
 
-With moves in feet, a camera's cable in its neighbour's socket or a rig's poses the wrong way round, some labels may
-still come out, at wrong places. So where too many sightings fit no map, the survey is read as if it held one of the
-usual mistakes; where that fits far better, the mistake is named and nothing is placed on the survey as it stands.
+With moves in feet, a camera's cable in its neighbour's socket, pictures of another size or a rig's poses the wrong way
+round, some labels may still come out, at wrong places. Such a survey shows strain: sightings fit no map, or fit it
+badly, moves contradict them, or the calibration does. Then the survey is read as if it held one of the usual mistakes;
+where that takes the strain away, the mistake is named and nothing is placed on the survey as it stands.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from itertools import combinations
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
+from scipy.special import gammaincc
 
 from ..errors import InputError
-from ..geometry.transforms import invert_rigid, transform_matrix, transform_record
-from ..records import Floats, Move, Sighting, Survey
-from .problem import CAMERA, ODOMETRY, Problem, build_problem, stops_per_label
+from .covariance import frame_covariance
+from .known_labels import slipped
+from .problem import CAMERA, ODOMETRY, SIGMA_FLOOR_PX, STOP, Problem, build_problem, stops_per_label
+from .readings import CAMERAS, LENSES, NEARLY, Reading, lengths, lenses, nearly, rigs, signs
 from .robust import Optimum, optimise
 
 FITS = 0.5  # share of the survey's sightings below which its calibration or its units are doubted
 FITS_NOT = 0.45  # and below which nothing is placed
-_UNSURE = 0.8  # share below which the units of moves are doubted: a third of wrong sightings is possible, but rare
+_UNSURE = 0.8  # share below which the survey is doubted: a third of wrong sightings is possible, but rare
+_MOSTLY = 0.9  # share below which sightings that scatter are doubted
 _LEAST_LIGHTS = 20  # to say so
 _CLEARLY_BETTER = 0.25  # of that share, to blame two cameras or anything else
 _RATHER_BETTER = 0.15  # to blame moves, if then nearly all fit
 _NEARLY_ALL = 0.9
 _MOST_TO_TRY = 5000  # sightings
-_FACTORS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet", 1e3: "kilometres"}
-_POWERS = (0.1, 10.0, 100.0)
+_SCATTERS, _SCATTERS_NOT = 1.8, 1.4  # times their stated standard deviations, or those of what lenses leave
+_NO_LENS = 4.0  # times that, where many sightings do not fit at all
+_SLIPPING = 0.25  # of the moves, and two: wheels slip once in twenty metres
+_MOSTLY_SLIPPED, _MANY_SLIPPED = 0.8, 3  # of the moves from which nothing is placed
+_IMPOSSIBLE, _POSSIBLE = 1e-8, 1e-4  # probabilities of how far the calibration is from its priors
+_TOLD = 0.02  # share of a prior's variance from which the survey tells about it
 _SUNKEN_M = 0.05  # below the floor, that slopes and steps explain
 _MANY_SUNKEN, _SUNKEN_SHARE = 3, 0.15  # labels, and of all labels, from which heights are doubted
 _STRAINED = 4.0  # standard deviations, of one value; of a root mean square over a rig half of it
+_ALONE = 0.5  # share of one camera's sightings, where those of the others fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,38 +53,159 @@ class Misfit:
     refused: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Strain:
+    """How well a survey fits its optimum.
+
+    `share` of the sightings that the map explains, by how much they `scatter` more than they should, how many of the
+    `moves` count as `slipped`, and the `chance` that rig, lenses and wheels are so far from what the priors say.
+    """
+
+    share: float
+    scatter: float
+    slipped: int
+    moves: int
+    chance: float
+
+    @property
+    def scatters(self) -> bool:
+        """Whether sightings fit worse than lenses and detectors explain."""
+        return self.scatter > _SCATTERS and self.share < _MOSTLY
+
+    @property
+    def slips(self) -> bool:
+        """Whether more moves contradict the sightings than wheels slip."""
+        return self.slipped >= max(2, _SLIPPING * self.moves)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the survey is doubtful."""
+        return self.share < _UNSURE or self.scatters or self.slips or self.chance < _IMPOSSIBLE
+
+    def is_relieved(self, other: Strain) -> bool:
+        """Whether another reading of the survey has none of this strain."""
+        if other.share < self.share - 0.02 or other.slipped > self.slipped:
+            return False
+        return (
+            (not self.scatters or other.scatter < _SCATTERS_NOT)
+            and (not self.slips or not other.slips)
+            and (self.chance >= _IMPOSSIBLE or other.chance > _POSSIBLE)
+            and (self.scatters or self.slips or self.chance < _IMPOSSIBLE)
+            and other.share > min(_UNSURE, self.share + _RATHER_BETTER)
+        )
+
+
+def strain(optimum: Optimum) -> Strain:
+    """How well the survey fits; scatter and calibration are not judged where too little shows."""
+    problem = optimum.problem
+    s, moves = problem.sightings, problem.moves
+    stated = np.maximum(problem.columns.sigma[s.source], SIGMA_FLOOR_PX)
+    scatter = float(np.median(s.sigma / stated)) if len(s) else 1.0
+    return Strain(explained_share(optimum), scatter, slipped(problem), len(moves.before), _chance(optimum))
+
+
 def misfit(asked: Problem, optimum: Optimum) -> Misfit:
     """Judge how much of a survey its optimum explains, and look for the mistake if that is little."""
-    share = explained_share(optimum)
-    little = f"only {100 * share:.0f} % of the sightings fit any map, so few labels are placed"
-    if share < _UNSURE and len(asked.sightings) <= _MOST_TO_TRY:
-        best, said = _best_reading(asked.survey, share, everything=share < FITS, scales=asked.frame == "first stop")
-        if best > share + _CLEARLY_BETTER or (best > share + _RATHER_BETTER and best > _NEARLY_ALL):
-            text = f"{little}; with {said} {100 * best:.0f} % do: check {_where(said)}"
-            return Misfit(share, text, "exchanged" not in said)
+    seen = strain(optimum)
+    little = f"only {100 * seen.share:.0f} % of the sightings fit any map, so few labels are placed"
+    if seen.is_there and len(asked.sightings) <= _MOST_TO_TRY:
+        found = _best_reading(asked, seen)
+        if found is not None:
+            reading, said, other = found
+            where = _where(reading)
+            if seen.share >= _MOSTLY:
+                doubt = f"the survey contradicts itself ({_complaints(seen)}); with {said} it does not: check {where}"
+                return Misfit(seen.share, doubt, reading.kind not in (CAMERAS, LENSES))
+            text = f"{little}; with {said} {100 * other.share:.0f} % do: check {where}"
+            return Misfit(seen.share, text, reading.kind != CAMERAS)
     labels = optimum.adjustment.labels
     heights = zip(optimum.state.points[labels, 2].tolist(), optimum.covariance.points[:, 2, 2].tolist(), strict=True)
     sunken = sum(is_below_floor(z, variance) for z, variance in heights)
     if sunken >= max(_MANY_SUNKEN, _SUNKEN_SHARE * len(labels)):
         text = f"{sunken} of {len(labels)} labels come out below the floor, so the heights of all are doubtful"
-        return Misfit(share, f"{text}: check that v counts downward, and the cameras' heights and tilts", True)
-    if share >= FITS:
-        return Misfit(share, None, False)
+        return Misfit(seen.share, f"{text}: check that v counts downward, and the cameras' heights and tilts", True)
+    if seen.share < _UNSURE and seen.scatter > _NO_LENS:
+        text = (
+            f"only {100 * seen.share:.0f} % of the sightings fit, and these scatter {seen.scatter:.1f} times too much"
+        )
+        return Misfit(seen.share, f"{text}: check the lenses' distortion and the pictures' size", True)
+    if seen.slipped >= max(_MANY_SLIPPED, _MOSTLY_SLIPPED * seen.moves):
+        text = f"{seen.slipped} of {seen.moves} moves are not what cameras saw, so size and axes are doubtful"
+        return Misfit(seen.share, f"{text}: check the moves, and where the cameras look on the robot", True)
+    if seen.share >= FITS:
+        return Misfit(seen.share, None, False)
     what = "the rig (which camera is which, metres, radians), the labels' ids and the moves' units"
-    return Misfit(share, f"{little}; check {what}", False)
+    return Misfit(seen.share, f"{little}; check {what}", False)
 
 
-def _best_reading(survey: Survey, share: float, everything: bool, scales: bool) -> tuple[float, str]:
-    """The mistake without which most sightings fit, more than `share`, and what share that is."""
-    best, said = share, ""
-    for hypothesis, other in _mistakes(survey, everything, scales):
+def _best_reading(asked: Problem, seen: Strain) -> tuple[Reading, str, Strain] | None:
+    """The mistake without which the survey fits clearly better, what to call it, and how it fits then."""
+    best: tuple[Reading, Optimum, Strain] | None = None
+    for reading in _readings(asked, seen):
         try:
-            found = explained_share(optimise(build_problem(other)))
+            optimum = optimise(build_problem(reading.survey))
         except InputError:  # read like that it would be impossible
             continue
-        if found > best:
-            best, said = found, hypothesis
-    return best, said
+        other = strain(optimum)
+        more = other.share - seen.share
+        better = more > _CLEARLY_BETTER or (more > _RATHER_BETTER and other.share > _NEARLY_ALL)
+        if not (better or seen.is_relieved(other)):
+            continue
+        if best is None or _merit(other) > _merit(best[2]):
+            best = reading, optimum, other
+            if other.share > _NEARLY_ALL and not (other.is_there or reading.kind == NEARLY):
+                break  # the others concern something else
+    return None if best is None else (best[0], best[0].described(best[1]), best[2])
+
+
+def _merit(strain: Strain) -> float:
+    """To compare readings by: sightings explained, less what contradicts them."""
+    unlikely = -math.log10(max(strain.chance, 1e-30))
+    return strain.share - 0.1 * (strain.scatter - 1.0) - 0.5 * strain.slipped / max(1, strain.moves) - 0.002 * unlikely
+
+
+def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
+    """Those that could explain such a strain."""
+    survey = asked.survey
+    everything = seen.share < FITS or seen.slips or seen.scatters
+    if seen.scatters:
+        yield from lenses(survey)
+    if asked.frame == "first stop":
+        yield from nearly(survey) if seen.share >= _UNSURE else lengths(survey)
+    if everything or seen.share < 0.5 * (FITS + _MOSTLY):
+        yield from chain(signs(survey), rigs(survey))
+    if not seen.scatters and (everything or seen.chance < _IMPOSSIBLE):
+        yield from lenses(survey)
+
+
+def _complaints(seen: Strain) -> str:
+    said = []
+    if seen.slips:
+        said.append(f"{seen.slipped} of {seen.moves} moves are not what cameras saw")
+    if seen.chance < _IMPOSSIBLE:
+        said.append("rig, lenses and wheels would all have to be far off their calibration")
+    return "; ".join(said) or "sightings scatter too much"
+
+
+def _chance(optimum: Optimum) -> float:
+    """Probability that the calibration is as far from its priors as the optimum has it; 1 where nothing tells.
+
+    What is estimated of a quantity scatters about its prior by the prior's variance less the one that is left.
+    """
+    problem = optimum.problem
+    entries = np.arange(STOP * problem.stop_count, len(problem.prior_sigma))
+    prior = problem.prior_sigma[entries]
+    entries, prior = entries[prior > 0.0], prior[prior > 0.0]
+    if len(entries) == 0 or len(problem.sightings) > _MOST_TO_TRY:
+        return 1.0
+    left = frame_covariance(optimum.adjustment, optimum.state)
+    if left is None:
+        return 1.0
+    spread = np.eye(len(entries)) - left[np.ix_(entries, entries)] / np.outer(prior, prior)
+    values, vectors = np.linalg.eigh(spread)
+    told = values > _TOLD
+    size = (vectors.T @ (optimum.state.frame[entries] / prior))[told] ** 2 / values[told]
+    return float(gammaincc(0.5 * len(size), 0.5 * size.sum())) if len(size) else 1.0
 
 
 def is_below_floor(z: float, variance: float) -> bool:
@@ -84,7 +214,7 @@ def is_below_floor(z: float, variance: float) -> bool:
 
 
 def strained(optimum: Optimum) -> list[str]:
-    """Sentences on priors that the optimum had to leave far behind."""
+    """Sentences on priors that the optimum had to leave far behind, and on cameras whose sightings do not fit."""
     problem, frame = optimum.problem, optimum.state.frame
     sigma, found = problem.prior_sigma, []
     names = ("scale", "turns", "drift")
@@ -104,16 +234,27 @@ def strained(optimum: Optimum) -> list[str]:
                 f"camera {camera.name} came out {size:.1f} times as far from its calibration as its priors allow; "
                 "calibrate the rig"
             )
+    shares = [explained_share(optimum, number) for number in range(len(problem.cameras))]
+    for number, camera in enumerate(problem.cameras):
+        others = [share for k, share in enumerate(shares) if k != number]
+        if shares[number] < _ALONE and others and min(others) > _UNSURE:
+            found.append(
+                f"of camera {camera.name}'s sightings only {100 * shares[number]:.0f} % fit, of the others' "
+                f"{100 * min(others):.0f} % or more; check its lens, its pictures' size and where it looks"
+            )
     return found
 
 
-def explained_share(optimum: Optimum) -> float:
+def explained_share(optimum: Optimum, camera: int | None = None) -> float:
     """Share of the lights that the map explains, among those of labels that two stops or more saw.
 
-    Of rival sightings one is right; what lies in glass or floor is explained too. Too few sightings say nothing.
+    Of rival sightings one is right; what lies in glass or floor is explained too. Too few sightings say nothing. Of
+    one camera's alone, if it is given.
     """
     problem, s = optimum.problem, optimum.problem.sightings
     seen = stops_per_label(s.label, s.stop, len(problem.labels))[s.label] >= 2
+    if camera is not None:
+        seen &= s.camera == camera
     lights = np.bincount(s.rival[seen]) > 0
     if np.count_nonzero(lights) < _LEAST_LIGHTS:
         return 1.0
@@ -121,61 +262,9 @@ def explained_share(optimum: Optimum) -> float:
     return float(np.count_nonzero(fits) / np.count_nonzero(lights))
 
 
-def _where(said: str) -> str:
-    if "exchanged" in said:
-        return "rig.cameras and the robot's cables"
-    return "the moves" if "moves" in said else "the rig and the cameras' pictures"
-
-
-def _mistakes(survey: Survey, everything: bool, scales: bool) -> Iterator[tuple[str, Survey]]:
-    """The survey without one of the usual mistakes, and what to call it."""
-    if scales:
-        for factor, unit in _FACTORS.items():
-            yield f"the moves read as {unit}", _with_moves(survey, factor, factor, 1.0)
-        for factor in _POWERS:
-            yield f"the moves times {factor:g}", _with_moves(survey, factor, factor, 1.0)
-    if not everything:
-        return
-    yield "turns of the moves read as degrees", _with_moves(survey, 1.0, 1.0, math.pi / 180.0)
-    yield "turns of the moves counted clockwise", _with_moves(survey, 1.0, 1.0, -1.0)
-    yield "y of the moves to the right", _with_moves(survey, 1.0, -1.0, 1.0)
-    yield "y of the moves to the right and turns clockwise", _with_moves(survey, 1.0, -1.0, -1.0)
-    for pair in combinations([camera.name for camera in survey.rig.cameras], 2):
-        renamed = {pair[0]: pair[1], pair[1]: pair[0]}
-        cameras = tuple(replace(c, name=renamed.get(c.name, c.name)) for c in survey.rig.cameras)
-        yield f"cameras {pair[0]} and {pair[1]} exchanged", replace(survey, rig=replace(survey.rig, cameras=cameras))
-    turned = tuple(
-        replace(c, T_robot_camera=transform_record(invert_rigid(transform_matrix(c.T_robot_camera))))
-        for c in survey.rig.cameras
-    )
-    yield "the cameras' poses inverted (camera from robot)", replace(survey, rig=replace(survey.rig, cameras=turned))
-    sizes = {c.name: c.size for c in survey.rig.cameras}
-    yield "pictures mirrored", _with_pixels(survey, lambda s: (sizes[s.camera][0] - 1.0 - s.u, s.v))
-    for factor in (0.5, 2.0):
-        zoomed = tuple(
-            replace(c, matrix=(c.matrix[0] * factor, c.matrix[1] * factor, c.matrix[2] * factor, c.matrix[3] * factor))
-            for c in survey.rig.cameras
-        )
-        yield f"the lenses' matrices times {factor:g}", replace(survey, rig=replace(survey.rig, cameras=zoomed))
-
-
-def _with_moves(survey: Survey, x: float, y: float, turn: float) -> Survey:
-    scale: Floats = np.diag([x, y, turn])
-
-    def changed(move: Move | None) -> Move | None:
-        if move is None:
-            return None
-        (a, b, c), (d, e, f), (g, h, i) = (scale @ np.array(move.covariance) @ scale).tolist()
-        return Move(
-            move.dx * x, move.dy * y, move.dheading * turn, ((a, b, c), (d, e, f), (g, h, i))
-        )  # an arc's errors
-
-    return replace(survey, stops=tuple(replace(stop, move=changed(stop.move)) for stop in survey.stops))
-
-
-def _with_pixels(survey: Survey, place: Callable[[Sighting], tuple[float, float]]) -> Survey:
-    def changed(sighting: Sighting) -> Sighting:
-        u, v = place(sighting)
-        return replace(sighting, u=u, v=v)
-
-    return replace(survey, stops=tuple(replace(s, sightings=tuple(map(changed, s.sightings))) for s in survey.stops))
+def _where(reading: Reading) -> str:
+    places = {
+        CAMERAS: "rig.cameras and the robot's cables",
+        LENSES: "the lenses' matrices and the size of the pictures that are taken",
+    }
+    return places.get(reading.kind, "the moves" if "moves" in reading.said else "the rig and the cameras' pictures")

@@ -21,11 +21,12 @@ from ..plan_records import Plan, PlannedFlash, PlannedLabel, PlannedStop
 from ..records import Floats, Map, Pose, Survey
 from ..typed_json import many_records
 from .belief import Rows
+from .known_labels import SLIPPED
 from .mapping import WIDEST_SIGMA_M, to_map
 from .neighbourhood import nearby
 from .outlook import GUESSES_M, Outlook, distances
 from .problem import Ints, build_problem
-from .robust import SLIPPED, Optimum, optimise
+from .robust import Optimum, optimise
 from .ways import Way, along_line, over_floor
 
 _WRONG_M = 0.5  # error of a position that is wrong
@@ -51,7 +52,7 @@ class PlanSettings:
     stop_s: float = 15.0
     flash_s: float = 0.5
     target_m: float = 0.0
-    least: float = 0.01
+    least: float = 0.05
     spare: float = 0.005
 
 

@@ -17,13 +17,13 @@ from ..records import Floats
 from .bundle import SQUARE, Adjustment, Loss, Solution
 from .covariance import Covariance, covariance
 from .initial import epipolar_moves, triangulate, world_rays
+from .known_labels import SLIPPED, contradicted, difference, slipped
 from .placement import Placement, at_first_stop, detach, place, retriangulate
 from .problem import Bools, Ints, Known, Problem, State, anchors, stops_per_label
 from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
 
 _SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
-SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # what a slipped move still says: one wheel spun for some centimetres
 _WRONG_KNOWN = 25.0
 _REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tell them apart, slack on the lens
 _EXPLAINED = 0.25  # weight of a sighting under that loss from which it counts as explained
@@ -91,6 +91,26 @@ def optimise(problem: Problem, start: Floats | None = None, grown: Placement | N
     `start` (S, 3) holds x, y, heading of every stop to begin from; by default those that odometry chains. `grown` is
     tried before all starts: a state near the optimum, for instance that of the same survey without its last stop.
     """
+    optimum = _optimise(problem, start, grown)
+    if not contradicted(problem, optimum.problem, optimum.state.points):
+        return optimum
+    # without them, where that takes the contradictions away
+    other = _optimise(at_first_stop(problem, ""), start, grown)
+    kept = np.isin(problem.known.label, other.adjustment.labels)
+    how = difference(problem.known.position[kept], other.state.points[problem.known.label[kept]])
+    fewer = slipped(optimum.problem) - slipped(other.problem)
+    if fewer < (0 if how else 2) or other.inlier.sum() < 0.98 * optimum.inlier.sum():
+        return optimum
+    note = (
+        "the known labels contradict the sightings and the moves, so the first stop fixes the world frame; "
+        + (f"they would fit {how}; " if how else "")
+        + "check their positions and names"
+    )
+    notes = (note, *(text for text in other.problem.notes if text))
+    return replace(other, problem=replace(other.problem, notes=notes))
+
+
+def _optimise(problem: Problem, start: Floats | None, grown: Placement | None) -> Optimum:
     problem, placement, solution, iterations = _best_start(problem, start, grown)
     return _finish(detach(problem, placement.placed), placement.placed, solution.state, iterations)
 

@@ -128,8 +128,11 @@ def compare(name, seeds, settings=SETTINGS, world=WORLD, every=None):
     fixed, advised = np.mean(rows, axis=0)
     route = "own stops" if every is None else f"every {every:g} m"
     stops, flashes = (100.0 * (advised[k] / fixed[k] - 1.0) for k in (2, 3))
+    apart = np.diff(np.array(rows)[:, :, 0], axis=1).ravel()
+    sure = apart.std(ddof=1) / np.sqrt(len(rows)) if len(rows) > 1 else np.inf
     print(
-        f"{name:<10}{route:<13}{len(rows)} seeds  mean error {fixed[0]:5.2f} -> {advised[0]:5.2f} mm  placed "
+        f"{name:<10}{route:<13}{len(rows)} seeds  mean error {fixed[0]:5.2f} -> {advised[0]:5.2f} mm (by "
+        f"{apart.mean():+.2f} +- {sure:.2f})  placed "
         f"{fixed[1]:.1f} -> {advised[1]:.1f}  stops {fixed[2]:.1f} -> {advised[2]:.1f} ({stops:+.0f} %)  "
         f"flashes {fixed[3]:.0f} -> {advised[3]:.0f} ({flashes:+.0f} %)",
         flush=True,
