@@ -12,6 +12,7 @@ from libc.string cimport memcpy
 cdef enum:
     LIMIT = 16  # of a change: 4 grey levels over an aperture; a label as weak as that still counts in full
     SHIFT_ROUNDS = 5
+    PARTS = 6  # of what is taken off light curves, at most
 
 cdef double AGREE_PX = 0.1  # a tile that is further off has somebody in it
 cdef double BETTER = 0.9  # a shift must explain the tiles so much better than none
@@ -130,24 +131,42 @@ def accumulate(
             _alternation_row(&difference[i, 0], &lagged_difference[i, 0], &total[i, 0], columns)
 
 
-def add_block(
-    const int16_t[:, ::1] block, int low, int high, float[:, ::1] total, float[:, ::1] clipped
+def rate_block(
+    const int16_t[:, ::1] sums, const float[:, ::1] middle, const float[:, ::1] rate, int low, int high, int8_t[:, ::1] out
 ):
-    cdef Py_ssize_t rows = block.shape[0], columns = block.shape[1], i, j
-    cdef int16_t value, least = <int16_t>low, most = <int16_t>high
+    cdef Py_ssize_t rows = sums.shape[0], columns = sums.shape[1], tiles = middle.shape[0], i, j, k
+    cdef float value, least = low, most = high
     cdef const int16_t* values
-    cdef float* sums
-    cdef float* limited
+    cdef const float* usual
+    cdef const float* scale
     with nogil:
         for i in range(rows):
-            values = &block[i, 0]
-            sums = &total[i, 0]
-            limited = &clipped[i, 0]
+            k = i // (rows // tiles)
+            k = tiles - 1 if k >= tiles else k
+            values = &sums[i, 0]
+            usual = &middle[k, 0]
+            scale = &rate[k, 0]
             for j in range(columns):
-                value = values[j]
-                sums[j] += value
+                value = (values[j] - usual[j]) * scale[j]
                 value = most if value > most else value
-                limited[j] += least if value < least else value
+                value = least if value < least else value
+                out[i, j] = <int8_t>value
+
+
+def add_block(const int8_t[:, ::1] rated, const float[:, ::1] weight, float[:, ::1] total):
+    cdef Py_ssize_t rows = rated.shape[0], columns = rated.shape[1], tiles = weight.shape[0], i, j, k
+    cdef const int8_t* values
+    cdef const float* counts
+    cdef float* sums
+    with nogil:
+        for i in range(rows):
+            k = i // (rows // tiles)
+            k = tiles - 1 if k >= tiles else k
+            values = &rated[i, 0]
+            counts = &weight[k, 0]
+            sums = &total[i, 0]
+            for j in range(columns):
+                sums[j] += counts[j] * values[j]
 
 
 def shift_moments(
@@ -307,33 +326,36 @@ def cut_patches(
 def project_runs(
     const float[:, ::1] values,
     const float[:, ::1] weights,
+    const float[:, :, ::1] nuisance,
     const float[:, ::1] waves,
     const Py_ssize_t[::1] first,
     const Py_ssize_t[::1] last,
     float[:, ::1] projection,
-    float[:, ::1] sums,
+    float[:, :, ::1] sums,
     float[:, ::1] squares,
 ):
-    cdef Py_ssize_t n = values.shape[0], frames = values.shape[1], c, f, k
-    cdef float value, weight
+    cdef Py_ssize_t n = values.shape[0], frames = values.shape[1], parts = nuisance.shape[1], c, f, k, b
+    cdef float value
     with nogil:
         projection[:, :] = 0
-        sums[:, :] = 0
+        sums[:, :, :] = 0
         squares[:, :] = 0
         for c in range(n):
             for f in range(frames):
-                weight = weights[c, f]
-                if weight > 0:
+                if weights[c, f] > 0:
                     value = values[c, f]
                     for k in range(first[f], last[f]):
                         projection[c, k] += value * waves[f, k]
-                        sums[c, k] += weight * waves[f, k]
-                        squares[c, k] += weight * waves[f, k] * waves[f, k]
+                        squares[c, k] += waves[f, k] * waves[f, k]
+                    for b in range(parts):
+                        value = nuisance[c, b, f]
+                        for k in range(first[f], last[f]):
+                            sums[c, b, k] += value * waves[f, k]
 
 
 def best_runs(
     const float[:, ::1] projection,
-    const float[:, ::1] sums,
+    const float[:, :, ::1] sums,
     const float[:, ::1] squares,
     Py_ssize_t step,
     const float[::1] frames,
@@ -343,8 +365,9 @@ def best_runs(
     Py_ssize_t[::1] periods,
     float[::1] light,
 ):
-    cdef Py_ssize_t n = projection.shape[0], starts = projection.shape[1], c, g, k, h
-    cdef float product, total, square, norm, value
+    cdef Py_ssize_t n = projection.shape[0], starts = projection.shape[1], parts = sums.shape[1], c, g, k, h, b
+    cdef float product, square, norm, value
+    cdef float total[PARTS]
     with nogil:
         for c in range(n):
             gain[c] = 0
@@ -353,18 +376,21 @@ def best_runs(
             light[c] = 0
             for g in range(starts - step):
                 product = projection[c, g]
-                total = sums[c, g]
                 square = squares[c, g]
+                for b in range(parts):
+                    total[b] = sums[c, b, g]
                 k = 1
                 h = g + step
                 while h < starts:
                     product += projection[c, h]
-                    total += sums[c, h]
                     square += squares[c, h]
+                    norm = square
+                    for b in range(parts):
+                        total[b] += sums[c, b, h]
+                        norm -= total[b] * total[b]
                     k += 1
                     h += step
                     if product > 0:
-                        norm = square - total * total / frames[c]
                         norm = norm if norm > least * frames[c] else least * frames[c]
                         value = product * product / norm
                         if value > gain[c]:

@@ -112,6 +112,7 @@ def test_the_accumulation_kernel_equals_its_numpy_reference(rows, columns, seed)
     before = rng.integers(-16, 17, (rows, columns), dtype=np.int8)
     tiles = np.column_stack([rng.uniform(50, 90, (6, 1)), rng.uniform(-9, 9, (6, 1)), rng.uniform(50, 90, (6, 3))])
     down, right = rng.integers(-1000, 1000, (2, rows, columns), dtype=np.int16)
+    usual = rng.uniform(0.1, 0.9, (3, rng.integers(1, 4), columns)).astype(np.float32)
     for move in ((0, 0), (-8000, 20000)):
         results = []
         for module in (kernels, reference):
@@ -122,12 +123,14 @@ def test_the_accumulation_kernel_equals_its_numpy_reference(rows, columns, seed)
             module.accumulate(cells, lagged, down, right, *move, difference, before, total, 3)
             moments = np.empty((2, 2, 3), np.float32)
             module.shift_moments(cells, down, right, down, 3, 2, moments)
-            sums, limited = np.zeros((2, rows, columns), np.float32)
-            module.add_block(down, -200, 300, sums, limited)
+            sums = np.ones((rows, columns), np.float32)
+            rated = np.zeros((rows, columns), np.int8)
+            module.rate_block(down, *usual[:2], -60, 120, rated)
+            module.add_block(rated, usual[2], sums)
             far = tiles[:, 0] * move[0] + tiles[:, 1] * move[1], tiles[:, 1] * move[0] + tiles[:, 2] * move[1]
             off = np.stack([*far, np.ones(6)], axis=1) * 1e-4 + np.random.default_rng(seed).normal(0.0, 9.0, (6, 3))
             shift = np.array(module.agreed_shift(off.astype(np.float32), tiles))
-            results.append((cells, difference, total, sums, limited, shift, moments))
+            results.append((cells, difference, total, rated, sums, shift, moments))
         for left, other in zip(*results, strict=True):
             np.testing.assert_allclose(left, other, rtol=1e-5, atol=4.0 if left.shape == moments.shape else 1e-6)
 
@@ -140,7 +143,9 @@ def test_light_curves_patches_and_runs_equal_their_numpy_references(seed):
     order = rng.permutation(7)[:5].astype(np.intp)
     rows, columns = rng.integers(3, 12, 4).astype(np.intp), rng.integers(3, 14, 4).astype(np.intp)
     projection = rng.normal(size=(4, 90)).astype(np.float32)
-    sums, squares = (3 + rng.random((2, 4, 90))).astype(np.float32)
+    squares = (9 + rng.random((4, 90))).astype(np.float32)
+    sums = rng.random((4, 3, 90)).astype(np.float32)
+    nuisance = rng.normal(size=(4, 3, 90)).astype(np.float32)
     frames = rng.integers(60, 97, 4).astype(np.float32)
     image = rng.integers(0, 256, (30, 40), dtype=np.uint8)
     waves = rng.random((90, 20)).astype(np.float32) * (np.abs(np.arange(20) - np.arange(90)[:, None] / 5.0) < 3.0)
@@ -157,9 +162,10 @@ def test_light_curves_patches_and_runs_equal_their_numpy_references(seed):
         gain, light = np.empty((2, 4), np.float32)
         start, periods = np.empty((2, 4), np.intp)
         module.best_runs(projection, sums, squares, 25, frames, 0.01, gain, start, periods, light)
-        runs = np.empty((3, 4, 20), np.float32)
-        module.project_runs(curves, weights, waves, first, last, *runs)
-        results.append((values, levels, patches, gain, start, periods, light, runs))
+        projected, squared = np.empty((2, 4, 20), np.float32)
+        taken = np.empty((4, 3, 20), np.float32)
+        module.project_runs(curves, weights, nuisance * weights[:, None], waves, first, last, projected, taken, squared)
+        results.append((values, levels, patches, gain, start, periods, light, projected, taken, squared))
     for left, right in zip(*results, strict=True):
         np.testing.assert_allclose(left, right, rtol=2e-5, atol=2e-3)
 

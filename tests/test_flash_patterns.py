@@ -14,12 +14,13 @@ from robotd.vision.mirror import Lamp, reflected
 from robotd.vision.pattern import Look
 from robotd.vision.shake import Shake, kernels
 from robotd.vision.thesis_blink import ThesisFlashConfig, ThesisFlashDetector, cost, periods_of
-from robotd.workbench.score import Score
+from robotd.workbench.score import Score, judge
 from tests.flashes.film import add, frames
 from tests.flashes.scenes import Light, Options, scene
 from tests.flashes.world import light_of, shelves
 
 SMALL = (192, 144)
+NO_SHIFT = np.zeros((60, 2))
 
 
 PATTERNS = (
@@ -355,3 +356,31 @@ def test_labels_of_the_thesis_s_table_are_found_in_two_seconds_and_their_reflect
     assert score.found >= 8 - swapped
     assert score.false <= swapped
     assert score.rms_px <= 0.06
+
+
+def missed(number, seed, pattern):
+    """Labels that two seconds of a film do not show to the detector, and the number of false ones."""
+    shown = scene(number, seed, Options(pattern=pattern, seconds=2.0))
+    flashes = FlashDetector(FlashConfig(pattern=pattern)).detect(*frames(shown))
+    verdict = judge(flashes, shown.labels, shown.mirrored)
+    return verdict.missed, len(verdict.false)
+
+
+def test_short_flashes_are_found_while_two_people_walk_past():
+    assert missed(11, 304, PATTERNS[3]) == ((), 0)
+
+
+def test_one_whole_period_is_enough_where_people_hide_the_others():
+    assert missed(13, 302, PATTERNS[0]) == ((), 0)
+
+
+def test_one_burst_of_light_is_no_period_of_three_flashes():
+    times = np.arange(60) / 30.0
+    values = 2.0 * np.random.default_rng(0).normal(size=(2, 60)).astype(np.float32)
+    values[0] += 60.0 * PATTERNS[0].coverage(times - 0.7, 0.01)
+    values[1, [21, 27, 33]] += (20.0, 90.0, 20.0)
+    matches = Matcher(PATTERNS[3], 0.01, (0.6, 10.0)).match(times, values[1:], np.ones((1, 60), np.float32), NO_SHIFT)
+    assert not matches.regular[0]
+    matches = Matcher(PATTERNS[0], 0.01, (0.6, 10.0)).match(times, values[:1], np.ones((1, 60), np.float32), NO_SHIFT)
+    assert matches.regular[0]
+    assert matches.start[0] % 1.0 == pytest.approx(0.7, abs=0.025)

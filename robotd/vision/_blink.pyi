@@ -14,9 +14,15 @@ def accumulate(
     total: NDArray[np.int16],
     before: int,
 ) -> None: ...
-def add_block(
-    block: NDArray[np.int16], low: int, high: int, total: NDArray[np.float32], clipped: NDArray[np.float32]
+def rate_block(
+    sums: NDArray[np.int16],
+    middle: NDArray[np.float32],
+    rate: NDArray[np.float32],
+    low: int,
+    high: int,
+    out: NDArray[np.int8],
 ) -> None: ...
+def add_block(rated: NDArray[np.int8], weight: NDArray[np.float32], total: NDArray[np.float32]) -> None: ...
 def shift_moments(
     cells: NDArray[np.uint8],
     reference: NDArray[np.int16],
@@ -42,6 +48,7 @@ def cut_patches(
 def project_runs(
     values: NDArray[np.float32],
     weights: NDArray[np.float32],
+    nuisance: NDArray[np.float32],
     waves: NDArray[np.float32],
     first: NDArray[np.intp],
     last: NDArray[np.intp],

@@ -47,6 +47,7 @@ Singles = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 _FEW = 4  # frames since the last decision that are not worth another one
+_DOUBT, _NEAR = 0.5, 8  # parts of the least score from which a place's neighbours are examined; so many places
 _NO_SPOT = 12.0  # refusals that a place counts which follows the pattern but is no small light: it costs most
 _LONGER = 2.5  # a slow camera's light curves are so much longer than `window_s`, because they have fewer frames
 _SHAKEN_PX = 1.5  # a picture that is further off is not compared
@@ -332,13 +333,23 @@ class FlashDetector:
         rows, columns = rows[:examined], columns[:examined]
         if not len(rows):
             return
+        scores, accepted = self._examine(rows, columns)
+        in_vain = np.flatnonzero(scores < _DOUBT * self._least())
+        self._alternation.refuse(rows[in_vain], columns[in_vain])
+        # because a weak light may pass only where the aperture is centred on it
+        near = [k for k in np.argsort(-scores) if scores[k] >= _DOUBT * self._least() and not accepted[k]][:_NEAR]
+        beside = [(rows[k] + i, columns[k] + j) for k in near for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+        if around := [place for place in beside if self._is_inside(*place)]:
+            self._examine(*np.array(around, np.intp).T.copy())
+
+    def _examine(self, rows: Indices, columns: Indices) -> tuple[Floats, NDArray[np.bool_]]:
+        """Match places, start a track where one follows the pattern; their scores, and which are accepted."""
         curves = self._curves(rows, columns)
         matches, accepted = self._match(curves)
-        in_vain = np.flatnonzero(matches.score < 0.5 * self._least())
-        self._alternation.refuse(rows[in_vain], columns[in_vain])
         for k in np.argsort(-matches.light):
             if accepted[k]:
                 self._add(int(k), matches, curves)
+        return matches.score, accepted
 
     @staticmethod
     def _joined(tracks: Sequence[Track], rows: Indices, columns: Indices) -> tuple[Indices, Indices]:
@@ -453,7 +464,7 @@ class FlashDetector:
         part = curves.of(chosen)
         shifts = self._shifts[part.numbers % FRAMES]
         rest = self._matcher.cleared(part.times, part.values, part.levels, shifts, part.flicker, start, periods)
-        if rest.weight < 2.0:
+        if rest.weight < 0.4:
             return
         patches = self._memory.patches(part.numbers[rest.seen], track.row, track.column)
         track.add(patches, self._memory.light, rest, float(curves.times[-1]))

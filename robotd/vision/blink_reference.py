@@ -67,12 +67,29 @@ def accumulate(
     total[:-1, :-1] -= difference[:-1, :-1].astype(np.int16) * lagged_difference[:-1, :-1]
 
 
-def add_block(
-    block: NDArray[np.int16], low: int, high: int, total: NDArray[np.float32], clipped: NDArray[np.float32]
+def rate_block(
+    sums: NDArray[np.int16],
+    middle: NDArray[np.float32],
+    rate: NDArray[np.float32],
+    low: int,
+    high: int,
+    out: NDArray[np.int8],
 ) -> None:
-    """Add `block` (h, w) to `total`, and limited to [low, high] to `clipped`."""
-    total += block
-    clipped += np.clip(block, low, high)
+    """Write (sums - middle) * rate, limited to [low, high] and cut to whole numbers, to `out` (h, w).
+
+    `middle` and `rate` (tiles, w) hold for bands of rows; the last band takes the rows that remain.
+    """
+    band = _bands(len(sums), len(middle))
+    out[:] = np.clip((sums - middle[band]) * rate[band], low, high)
+
+
+def add_block(rated: NDArray[np.int8], weight: NDArray[np.float32], total: NDArray[np.float32]) -> None:
+    """Add `rated` (h, w), times the `weight` (tiles, w) of each band of rows, to `total`."""
+    total += weight[_bands(len(rated), len(weight))] * rated
+
+
+def _bands(rows: int, tiles: int) -> NDArray[np.intp]:
+    return np.minimum(np.arange(rows) // (rows // tiles), tiles - 1)
 
 
 def shift_moments(
@@ -200,6 +217,7 @@ def cut_patches(
 def project_runs(
     values: NDArray[np.float32],
     weights: NDArray[np.float32],
+    nuisance: NDArray[np.float32],
     waves: NDArray[np.float32],
     first: NDArray[np.intp],
     last: NDArray[np.intp],
@@ -213,15 +231,17 @@ def project_runs(
     ----------
     values, weights : (N, F) float32
         Light curves, zero where their weight is.
+    nuisance : (N, B, F) float32
+        Orthonormal curves that were taken off each light curve, zero where the weight is; at most 6.
     waves : (F, S) float32
         Share of each exposure in which a pattern that begins at each start is on.
     first, last : (F,) intp
         Starts [first, last) at which that is not zero; they save work.
-    projection, sums, squares : (N, S) float32, out
-        Sums over the frames of values * waves, weights * waves, and weights * waves^2.
+    projection, sums, squares : (N, S), (N, B, S), (N, S) float32, out
+        Sums over the frames of values * waves, nuisance * waves, and weights * waves^2.
     """
     projection[:] = values @ waves
-    sums[:] = weights @ waves
+    sums[:] = nuisance @ waves
     squares[:] = weights @ waves**2
 
 
@@ -242,16 +262,16 @@ def best_runs(
     Parameters
     ----------
     projection : (N, G) float32
-        Scalar product of each centred light curve with one period of the pattern from each start.
-    sums, squares : (N, G) float32
-        Sum and sum of squares of that period's samples, over the frames that count for the light curve.
+        Scalar product of each light curve, less its nuisance, with one period of the pattern from each start.
+    sums, squares : (N, B, G), (N, G) float32
+        Scalar products of that period's samples with the nuisance and with themselves, over the frames that count.
     step : int
         Starts from one period to the next.
     frames : (N,) float32
         Frames that count for each light curve.
     least : float
-        Least energy per frame of a centred pattern that is divided by, so that patterns which hardly touch the window
-        do not win.
+        Least energy per frame, of a pattern less the nuisance, that is divided by, so that patterns which hardly touch
+        the window do not win.
     gain, start, periods, light : (N,), out
         Energy explained, index of the start, number of periods, and light of the source.
     """
@@ -265,10 +285,10 @@ def best_runs(
     while rest > step:
         rest -= step
         product = product[:, :rest] + projection[:, number * step :]
-        total = total[:, :rest] + sums[:, number * step :]
+        total = total[:, :, :rest] + sums[:, :, number * step :]
         square = square[:, :rest] + squares[:, number * step :]
         number += 1
-        norm = np.maximum(square - total * total / frames[:, None], least * frames[:, None])
+        norm = np.maximum(square - (total * total).sum(axis=1), least * frames[:, None])
         value = np.where(product > 0, product * product / norm, 0)
         top = np.argmax(value, axis=1)
         rows = np.arange(len(top))

@@ -70,10 +70,11 @@ class FlashExplanation:
 def explain_blink(detector: FlashDetector, shape: tuple[int, int]) -> FlashExplanation:
     """The state of `FlashDetector` in images of this shape (H, W)."""
     threshold = detector.config.min_score(shape)
-    unit = "alternation in the pattern's rhythm"
+    unit = "alternation in the pattern's rhythm, in limits"
     if detector._alternation is None or not detector._alternation.is_ready:
         return FlashExplanation(np.zeros(shape, np.float32), unit, (), (), threshold)
-    change = cv2.resize(np.sqrt(detector._alternation.energy()), shape[::-1], interpolation=cv2.INTER_NEAREST)
+    over = np.maximum(detector._alternation.standing_out(), 0.0)
+    change = cv2.resize(over, shape[::-1], interpolation=cv2.INTER_NEAREST)
     clusters = [_track(detector, track) for track in detector.tracks]
     triggers = []
     known = len(detector.tracks)

@@ -22,7 +22,7 @@ Indices = NDArray[np.intp]
 
 BEFORE, AFTER = 3, 5  # cells around an aperture's first one that its ring needs: 8x8 in all
 FRAMES = 96  # of a light curve
-PICTURES = 48  # kept: 3.9 MB of 640x480 pixels
+PICTURES = 60  # kept: 4.9 MB of 640x480 pixels, two seconds at 30 frames a second
 
 
 class FlashMemory:

@@ -7,7 +7,7 @@ the picture explains is taken off first. Steady blinking at other rates is a riv
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,16 @@ Indices = NDArray[np.intp]
 _LEAST = 0.01  # energy per frame below which a pattern hardly touches the window
 _HIDDEN = 0.02  # relative change of the light around a place that says somebody stands before it,
 _SPREADS = 5.0  # beyond so many of its usual spreads
+_STEPS = 2.0  # typical steps between frames, of which its usual spread has no more
 _LEAST_SEEN = 0.4  # of the frames that are known
 _OUTLIER = 4.5  # spreads of the residual
 _ENOUGH = 0.3  # of a period's energy that must be within the window, to count by itself
+_CARRIES, _LACKS = 0.5, 0.25  # of the light that is expected in a period: it carries the pattern, or lacks it
+_CLEAN, _SEVERAL = 0.08, 3  # of the energy, left by so many flashes: they need no second period
 _LOOK_S, _LOOK_PITCH_S = 0.03, 0.0015  # starts so far from the best match are weighed, at this pitch
 _PROMISING = 12.0  # explained energy of a place, relative to a frame's, from which its start is refined,
-_BESIDE, _FINE_S = 0.75, 0.004  # within so many steps of the search, to so many seconds
+_BESIDE, _FINE = 0.75, 0.2  # within so many steps of the search, to such a part of a step
+_PITCH = 2.0  # 1/s, times the square of a flash's length is that step: half exposed frames are much of a short flash
 _LIKELY = 10.0  # score from which a place is compared with steady blinking, of so many harmonics
 _HARMONICS = 3
 _ALIKE = 0.7  # of the pattern's energy: steady blinking that explains so much is the pattern
@@ -86,11 +90,13 @@ class Matcher:
         self._pattern = pattern
         self._exposure = exposure
         self._template = Template(pattern, exposure)
+        self._flashes = [Template(replace(pattern, on=(flash,)), exposure) for flash in pattern.on]
         self._steady_hz = steady_hz
         self._sampled: tuple[int, float] | None = None  # number of frames and seconds for which `_is_rival` holds
         self._is_rival = np.zeros(0, bool)
         shortest = min(end - start for start, end in pattern.on)
-        self._step = max(8, int(np.ceil(pattern.period / min(0.02, max(0.004, 0.3 * shortest)))))
+        pitch = min(0.02, max(0.004, _PITCH * shortest**2))
+        self._step = max(8, int(np.ceil(pattern.period / pitch)))
 
     def match(
         self,
@@ -213,10 +219,16 @@ class Matcher:
 
     @staticmethod
     def _seen(levels: Singles) -> NDArray[np.bool_]:
+        """Frames in which nobody stands before a place, or is just about to."""
         usual = _middle(levels)
         away = np.abs(levels - usual)
-        spread = 1.48 * _middle(away)
-        return np.asarray(away <= _SPREADS * spread + _HIDDEN * usual + 0.15)
+        # by frames that follow one another, too, because who stands there for a while spreads the levels
+        spread = np.minimum(1.48 * _middle(away), _STEPS * _middle(np.abs(np.diff(levels, axis=1))))
+        seen = away <= _SPREADS * spread + _HIDDEN * usual + 0.15
+        clear = seen.copy()
+        clear[:, 1:] &= seen[:, :-1]
+        clear[:, :-1] &= seen[:, 1:]
+        return np.asarray(clear)
 
     def _search(
         self,
@@ -230,15 +242,17 @@ class Matcher:
         """Best match over all starts and numbers of periods, and what it leaves of every frame."""
         weights = seen.astype(np.float32)
         frames = np.maximum(weights.sum(axis=1), 1.0).astype(np.float32)
-        y = weights * _without(values, weights, basis)
+        nuisance = _orthonormal(basis, weights)
+        y = _less(values * weights, nuisance)
         energy = np.einsum("nf,nf->n", y, y).astype(float) + 1e-6
         places = len(y)
-        projection, sums, squares = (np.empty((places, len(starts)), np.float32) for _ in range(3))
+        projection, squares = np.empty((2, places, len(starts)), np.float32)
+        sums = np.empty((*nuisance.shape[:2], len(starts)), np.float32)
         waves = np.ascontiguousarray(single.T)
         touched = waves > 0.0
         first = np.argmax(touched, axis=1)
         last = len(starts) - np.argmax(touched[:, ::-1], axis=1)
-        kernels.project_runs(np.ascontiguousarray(y), weights, waves, first, last, projection, sums, squares)
+        kernels.project_runs(y, weights, nuisance, waves, first, last, projection, sums, squares)
         gain, light = np.empty(places, np.float32), np.empty(places, np.float32)
         start, periods = np.empty(places, np.intp), np.empty(places, np.intp)
         kernels.best_runs(projection, sums, squares, self._step, frames, _LEAST, gain, start, periods, light)
@@ -246,19 +260,23 @@ class Matcher:
         begin: Floats = starts[start]
         promising = np.flatnonzero(frames * gain > _PROMISING * energy)
         if len(promising):
-            self._refine(times, y, weights, frames, begin, count, promising)
+            self._refine(times, y, weights, nuisance, begin, count, promising)
         parts = [
             self._template(times - (begin + k * self._pattern.period)[:, None]) * (k < periods)[:, None]
             for k in range(int(periods.max(initial=0.0)))
         ]
         wave = np.sum(parts, axis=0) if parts else np.zeros_like(y)
-        wave, gain, light = _regressed(y, weights, frames, wave)
+        wave, gain, light = _regressed(y, weights, nuisance, wave)
         left = np.maximum(energy - gain, 1e-6)
-        residual = (y - light[:, None] * wave) * weights
+        residual = y - light[:, None] * wave
         half = 0.5 * (frames.astype(float) - basis.shape[1])
         score = half * np.log(energy / left)
-        steady, doubtful = energy.copy(), score > _LIKELY
-        steady[doubtful] = self._steady_residual(times, y[doubtful], weights[doubtful], energy[doubtful])
+        steady, regular, likely = energy.copy(), np.zeros(places, bool), np.flatnonzero(score > _LIKELY)
+        if len(likely):
+            curves = y[likely], weights[likely], nuisance[likely]
+            steady[likely] = self._steady_residual(times, *curves[:2], energy[likely])
+            since = times - begin[likely, None]
+            regular[likely] = self._regular(since, count[likely], curves, wave[likely], light[likely])
         matches = Matches(
             score=score,
             margin=half * np.log(steady / left),
@@ -266,17 +284,42 @@ class Matcher:
             periods=periods.astype(np.intp),
             light=light.astype(float),
             variance=left / np.maximum(frames - 2.0, 1.0),
-            regular=_is_regular(y, weights, parts, light),
+            regular=regular,
             frames=frames.astype(float),
         )
         return matches, residual
+
+    def _regular(
+        self, since: Floats, periods: Floats, curves: tuple[Singles, Singles, Singles], wave: Singles, light: Singles
+    ) -> NDArray[np.bool_]:
+        """Two periods or more must each carry their share: one burst of clutter is no pattern.
+
+        One period of several flashes is enough if each carries its share and hardly anything else is left.
+        """
+
+        def parts(template: Template) -> list[Singles]:
+            begun = range(int(periods.max()))
+            return [template(since - k * self._pattern.period) * (k < periods)[:, None] for k in begun]
+
+        steady, carrying = _is_regular(*curves, parts(self._template), wave, light)
+        left = curves[0] - light[:, None] * wave
+        clean = np.einsum("nf,nf->n", left, left) <= _CLEAN * np.einsum("nf,nf->n", curves[0], curves[0])
+        whole = np.flatnonzero(steady & (carrying == 1) & clean & (len(self._flashes) >= _SEVERAL))
+        regular = steady & (carrying >= 2)
+        if len(whole):
+            since, periods = since[whole], periods[whole]
+            flashes = [part for template in self._flashes for part in parts(template)]
+            y, weights, nuisance = (curve[whole] for curve in curves)
+            each, several = _is_regular(y, weights, nuisance, flashes, wave[whole], light[whole])
+            regular[whole] = each & (several >= _SEVERAL)
+        return np.asarray(regular)
 
     def _refine(
         self,
         times: Floats,
         y: Singles,
         weights: Singles,
-        frames: Singles,
+        nuisance: Singles,
         begin: Floats,
         periods: Floats,
         chosen: Indices,
@@ -285,20 +328,18 @@ class Matcher:
 
         Short flashes need it: within one step they may fall from one exposure into the gap before the next.
         """
-        y, weights, frames = y[chosen], weights[chosen], frames[chosen]
+        y, weights, nuisance = y[chosen], weights[chosen], nuisance[chosen]
         middle, best = begin[chosen], np.full(len(chosen), -1.0)
         pitch = self._pattern.period / self._step
-        for offset in pitch * np.linspace(-_BESIDE, _BESIDE, 2 * int(np.ceil(_BESIDE * pitch / _FINE_S)) + 1):
+        for offset in pitch * np.linspace(-_BESIDE, _BESIDE, 2 * int(np.ceil(_BESIDE / _FINE)) + 1):
             wave = self._template.run(times - (middle + offset)[:, None], periods[chosen, None])
-            _, gain, light = _regressed(y, weights, frames, wave)
+            _, gain, light = _regressed(y, weights, nuisance, wave)
             better = (gain > best) & (light > 0.0)
             best[better] = gain[better]
             begin[chosen[better]] = middle[better] + offset
 
     def _steady_residual(self, times: Floats, y: Singles, weights: Singles, energy: Floats) -> Floats:
         """What the best steady blinking (three harmonics, any rate) leaves of each light curve's energy."""
-        if not len(y):
-            return energy
         turns = self._rivals(times)
         if not len(turns):
             return energy
@@ -320,31 +361,32 @@ class Matcher:
         return np.asarray(turns[: len(is_rival)][is_rival])
 
 
-def _regressed(y: Singles, weights: Singles, frames: Singles, wave: Singles) -> tuple[Singles, Singles, Singles]:
-    """The wave (N, F) centred over the frames that count, the energy it explains of each y, and its factor."""
-    wave = wave - (np.einsum("nf,nf->n", wave, weights) / frames)[:, None]
+def _regressed(y: Singles, weights: Singles, nuisance: Singles, wave: Singles) -> tuple[Singles, Singles, Singles]:
+    """The wave (N, F) less its nuisance, over the frames that count, the energy it explains of y, and its factor."""
+    wave = _less(wave * weights, nuisance)
     product = np.einsum("nf,nf->n", y, wave)
-    norm = np.maximum(np.einsum("nf,nf,nf->n", wave, wave, weights), _LEAST * frames)
+    norm = np.maximum(np.einsum("nf,nf->n", wave, wave), _LEAST * np.maximum(weights.sum(axis=1), 1.0))
     return wave, product * product / norm, product / norm
 
 
-def _is_regular(y: Singles, weights: Singles, parts: list[Singles], light: Singles) -> NDArray[np.bool_]:
-    """Two periods or more must each carry their share: one burst of clutter is no pattern.
+def _is_regular(
+    y: Singles, weights: Singles, nuisance: Singles, parts: list[Singles], wave: Singles, light: Singles
+) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Whether none of a pattern's parts lacks its share of the light, and how many carry theirs.
 
-    Periods that the window cuts short count together, because two seconds may hold no two whole ones.
+    Parts that the window cuts short count together, because two seconds may hold no two whole periods.
     """
-    if not parts:
-        return np.zeros(len(y), bool)
-    products = np.stack([np.einsum("nf,nf->n", y, part) for part in parts], axis=1)
-    energies = np.stack([np.einsum("nf,nf,nf->n", weights, part, part) for part in parts], axis=1)
+    shown = [_less(part * weights, nuisance) for part in parts]
+    products = np.stack([np.einsum("nf,nf->n", y, part) for part in shown], axis=1)
+    expected = np.stack([np.einsum("nf,nf->n", wave, part) for part in shown], axis=1) * light[:, None]
+    energies = np.stack([np.einsum("nf,nf->n", part, part) for part in shown], axis=1)
     enough = np.maximum(_ENOUGH * energies.max(axis=1, keepdims=True), 1e-6)
     counted = energies >= enough
-    share = products / np.maximum(energies, 1e-6)
-    carrying = np.count_nonzero(counted & (share >= 0.4 * light[:, None]), axis=1)
-    missing = np.any(counted & (share < 0.2 * light[:, None]), axis=1)
-    product, energy = np.where(counted, 0.0, products).sum(axis=1), np.where(counted, 0.0, energies).sum(axis=1)
-    carrying += (energy >= enough[:, 0]) & (product >= 0.4 * light * energy)
-    return np.asarray((carrying >= 2) & ~missing)
+    carrying = np.count_nonzero(counted & (products >= _CARRIES * expected), axis=1)
+    missing = np.any(counted & (products < _LACKS * expected), axis=1)
+    product, least = (np.where(counted, 0.0, sums).sum(axis=1) for sums in (products, _CARRIES * expected))
+    carrying += (np.where(counted, 0.0, energies).sum(axis=1) >= enough[:, 0]) & (product >= least)
+    return ~missing, carrying
 
 
 def _steadied(values: Singles, levels: Singles, flicker: Singles | None) -> tuple[Singles, Singles, Singles]:
@@ -383,19 +425,22 @@ def _moved(shifts: Floats) -> Singles:
     return np.concatenate([constant, parts / scale], axis=1).astype(np.float32)
 
 
-def _without(values: Singles, weights: Singles, basis: Singles) -> Singles:
-    """Values (N, F) less what the basis (F, B) explains of them by weighted least squares."""
+def _orthonormal(basis: Singles, weights: Singles) -> Singles:
+    """Per place the basis (F, B) over the frames that count, made orthonormal: (N, B, F)."""
     if basis.shape[1] == 1:
-        mean = np.einsum("nf,nf->n", values, weights) / np.maximum(weights.sum(axis=1), 1.0)
-        return np.asarray(values - mean[:, None])
+        return np.asarray((weights / np.sqrt(np.maximum(weights.sum(axis=1), 1.0))[:, None])[:, None])
     b = basis.astype(float)
     products = (b[:, :, None] * b[:, None, :]).reshape(len(b), -1)
     # no matrix product: its library would wake threads for it, which cost more than they save
-    normal = np.einsum("nf,fk->nk", weights, products).reshape(len(values), *2 * b.shape[1:])
-    normal += 1e-3 * np.eye(b.shape[1])
-    right = np.einsum("nf,fk->nk", weights * values, b)
-    factors = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-    return np.asarray(values - factors @ b.T, np.float32)
+    normal = np.einsum("nf,fk->nk", weights, products).reshape(len(weights), *2 * b.shape[1:])
+    lower = np.linalg.cholesky(normal + 1e-3 * np.eye(b.shape[1]))
+    return np.asarray(np.linalg.solve(lower, b.T[None]) * weights[:, None], np.float32)
+
+
+def _less(curves: Singles, nuisance: Singles) -> Singles:
+    """Curves (N, F) less what their nuisance explains of them; both are zero in frames that do not count."""
+    shares = np.einsum("nbf,nf->nb", nuisance, curves)
+    return np.asarray(curves - np.einsum("nb,nbf->nf", shares, nuisance))
 
 
 def _explained(y: Singles, weights: Singles, turns: NDArray[np.complex64]) -> Floats:

@@ -45,6 +45,7 @@ class Shake:
         height, width = image.shape[0] // 2, image.shape[1] // 2
         self._reference = np.ascontiguousarray(_fours(_fours(pixels[1:, 1:]).T).T[:height, :width])
         self._down, self._right = self.down, self.right = _gradients(pixels)
+        del pixels  # because what follows needs as much memory again
         tiles_down, tiles_right = self._tiled(self._down), self._tiled(self._right)
         self._mean = np.stack([tiles_right.mean(axis=1), tiles_down.mean(axis=1)])
         tiles_right, tiles_down = tiles_right - self._mean[0][:, None], tiles_down - self._mean[1][:, None]
