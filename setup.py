@@ -32,6 +32,7 @@ KERNELS = {
     "sensor": "robotd.sim._sensor",
     "bundle": "robotd.solver._bundle",
     "rays": "robotd.solver._rays",
+    "throughput": "robotd.identify._throughput",
     "json_keys": "robotd._json_keys",
     "sightings": "robotd._sightings",
 }

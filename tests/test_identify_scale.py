@@ -7,6 +7,7 @@ import pytest
 
 from robotd.geometry.camera import Camera
 from robotd.geometry.transforms import invert_rigid, pose_matrix, transform_points
+from robotd.identify import throughput
 from robotd.identify.alignment import align
 from robotd.identify.decoder import Prior, decode
 from robotd.identify.delays import DelayModel
@@ -57,6 +58,46 @@ def test_no_wrong_throughput_is_believed_that_a_dozen_lights_fit_by_accident():
         assert outcome.right >= 35
         assert outcome.undecided <= 2
         assert 1.0 / outcome.inquiry.delays.interval == pytest.approx(10.0, rel=0.03)
+
+
+def test_the_kernel_of_the_throughput_gives_what_numpy_does():
+    rng = np.random.default_rng(3)
+    sizes = rng.integers(1, 9, 6)
+    answered = rng.integers(0, 3, sizes.sum())
+    number = int(answered.sum())
+    answers = throughput.Answers(
+        begins=np.append(0, np.cumsum(answered)),
+        slot=(slot := rng.integers(0, 2, number)),
+        turn=rng.integers(0, 90, number),
+        portion=3 * slot + rng.integers(0, 3, number),
+        start=rng.uniform(0.0, 12.0, number).astype(np.float32),
+        right=rng.uniform(0.0, 60.0, number).astype(np.float32),
+        instead=rng.uniform(0.01, 0.1, number).astype(np.float32),
+        portions=np.array([0, 3, 6]),
+        gates=np.array([0.0, 3.0, 6.0, 0.0, 1.0, 9.0]),
+        heads=np.array([0, 30, 60, 0, 30, 60]),
+        table=rng.uniform(0.0, 5.0, (2, 400)).astype(np.float32),
+    )
+    intervals, odds = np.geomspace(0.02, 0.5, 40), rng.uniform(0.0, 1.0, sizes.sum())
+    lights = np.append(0, np.cumsum(sizes))
+    expected = throughput.reference_log_likelihoods(intervals, odds, lights, answers)
+    found = throughput.log_likelihoods(intervals, odds, lights, answers)
+    off = np.abs(found - expected)  # a flash on the border of two cells of the table may be in either
+    assert np.ptp(expected) > 1.0
+    assert np.median(off) < 1e-6
+    assert np.mean(off < 1e-4) > 0.9
+
+
+def test_few_lights_leave_the_part_of_the_grid_that_all_lights_choose():
+    outcome = coded_stops(400, 40, ONE, [2], commands_per_s=14.0)[0]
+    evidence, prior = outcome.inquiry.evidence, Prior(outcome.inquiry.candidates.weights)
+    whole = []
+    for part in (throughput.PART, 1):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(throughput, "PART", part)
+            whole.append(throughput.search_interval(evidence, prior, DelayModel(ONE)))
+    assert whole[0] == whole[1]
+    assert 1.0 / whole[0] == pytest.approx(14.0, rel=0.05)
 
 
 def test_labels_seen_before_are_named_by_their_place_in_a_short_stop():

@@ -190,13 +190,13 @@ class Kernel:
     """Tabulated density of lateness, relative to a uniform one."""
 
     def __init__(self, table: Floats) -> None:
-        self._table = table.astype(np.float32)
-        self.largest = float(self._table.max())
+        self.table = table.astype(np.float32)
+        self.largest = float(self.table.max())
 
     def __call__(self, lateness: NDArray[Any]) -> NDArray[np.float32]:
         """Ratio for lateness in seconds, any shape."""
         index = ((lateness + (STAMP_S + 0.5 * TABLE_STEP_S)) * (1.0 / TABLE_STEP_S)).astype(np.int32)
-        return self._table.take(index, mode="clip")
+        return self.table.take(index, mode="clip")
 
 
 def _diffuse(phases: Floats, spread: float) -> Floats:
