@@ -309,12 +309,7 @@ def save_floor_camera(camera: CameraModel, path: Path, note: str) -> None:
     """
     text = _text(path)
     text = replace_table(text, "floor_camera", assignments(camera), str(path))
-    maker = note.split(":")[0]
-    lines = [line for line in text.splitlines() if not line.startswith(f"# {maker}:")]
-    header = next(k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[floor_camera]"))
-    lines.insert(header + 1, f"# {note}")
-    text = "\n".join(lines) + "\n"
-    _save(path, text)
+    _save(path, _noted(text, "floor_camera", note))
 
 
 def save_lens(camera: CameraModel, path: Path, priors: Priors) -> None:
@@ -360,15 +355,13 @@ def save_lens(camera: CameraModel, path: Path, priors: Priors) -> None:
     _save(path, text)
 
 
-def save_rig(cameras: Sequence[CameraModel], beacons: Mapping[str, Vector3], path: Path, priors: Priors) -> None:
+def save_rig(cameras: Sequence[CameraModel], path: Path, priors: Priors) -> None:
     """Write the cameras' poses into calibration.toml; their lenses and all else in the file stay as they were.
 
     Parameters
     ----------
     cameras : sequence of CameraModel
         One that the file lacks is added, with its lens.
-    beacons : mapping of str to (x, y, z)
-        Only those to be changed.
     path : Path
         Need not exist; replaced atomically.
     priors : Priors
@@ -389,21 +382,39 @@ def save_rig(cameras: Sequence[CameraModel], beacons: Mapping[str, Vector3], pat
         text = replace_element(text, "cameras", camera.name, kept, str(path))
     names = ("camera_rotation_rad", "camera_translation_m")
     text = replace_table(text, "priors", {name: repr(getattr(priors, name)) for name in names}, str(path))
-    if beacons:
-        text = replace_table(text, "beacons", {name: toml(place) for name, place in beacons.items()}, str(path))
     _save(path, text)
 
 
-def save_stamp_offsets(offsets: Mapping[str, float], path: Path) -> None:
+def save_beacons(beacons: Mapping[str, Vector3], sigma: float, path: Path) -> None:
+    """Write beacons' places (x, y, z) into calibration.toml, and their standard deviation into `[priors] beacon_m`.
+
+    Those that are not given, and all else in the file, stay as they were. The file need not exist and is replaced
+    atomically. Raises ConfigError if it cannot be read or edited.
+    """
+    text = replace_table(_text(path), "beacons", {name: toml(place) for name, place in beacons.items()}, str(path))
+    text = replace_table(text, "priors", {"beacon_m": repr(float(f"{sigma:.2g}"))}, str(path))
+    _save(path, text)
+
+
+def save_stamp_offsets(offsets: Mapping[str, float], path: Path, note: str) -> None:
     """Write [stamp_offsets] into calibration.toml, which need not exist; all else in the file stays as it was.
 
-    Replaces the file atomically. Raises ConfigError if the file cannot be read or edited.
+    `note` becomes a comment in place of an earlier one of the same maker, which stands before its first colon. Replaces
+    the file atomically. Raises ConfigError if the file cannot be read or edited.
     """
     text = _text(path)
     text = replace_table(
         text, "stamp_offsets", {name: repr(round(late, 5)) for name, late in offsets.items()}, str(path)
     )
-    _save(path, text)
+    _save(path, _noted(text, "stamp_offsets", note))
+
+
+def _noted(text: str, table: str, note: str) -> str:
+    """The file with a note under a table's header, in place of an earlier one of the same maker."""
+    maker = note.split(":")[0]
+    lines = [line for line in text.splitlines() if not line.startswith(f"# {maker}:")]
+    header = next(k for k, line in enumerate(lines) if line.replace(" ", "").startswith(f"[{table}]"))
+    return "\n".join([*lines[: header + 1], f"# {note}", *lines[header + 1 :]]) + "\n"
 
 
 def _lines(record: Any) -> list[str]:

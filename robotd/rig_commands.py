@@ -1,6 +1,7 @@
-"""The arguments of `robotd-solver calibrate rig`, `odometry` and `time`; what they run is in rig_tool and time_tool.
+"""The arguments of `robotd-solver calibrate rig`, `odometry`, `beacons`, `time` and `flash`.
 
-Apart from these, because a command line that only prints its help should not load scipy.
+What they run is in rig_tool, time_tool and flash_tool: apart, because a command line that only prints its help should
+not load scipy.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ from pathlib import Path
 
 
 def add_calibrate_rig(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """The arguments of `robotd-solver calibrate rig` and `robotd-solver calibrate odometry`."""
+    """The arguments of `robotd-solver calibrate rig`, `odometry` and `beacons`."""
     rig = kinds.add_parser(
         "rig",
         help="where the cameras and beacons are on the robot, from surveys with turns between stops",
         description="No two cameras need to see the same thing at the same time: what one saw another sees after a"
-        " turn. Best are 20 stops, 3 to 4 at each place, turned by 90 or 120 degrees on the spot between them. Several"
-        " surveys of one shop are calibrated together.",
+        " turn. Best are 20 stops as `robotctl calibrate rig` makes them: at each of five places 25 cm out and back."
+        " Several surveys of one shop are calibrated together.",
     )
     _add_surveys(rig)
     rig.add_argument(
@@ -53,7 +54,18 @@ def add_calibrate_rig(kinds: argparse._SubParsersAction[argparse.ArgumentParser]
         " surveys must have been driven with the [wheels] that the calibration file holds.",
     )
     _add_surveys(odometry)
+    odometry.add_argument("--picture", type=Path, metavar="PNG", help="also draw what is left of every move")
     odometry.set_defaults(run=_run_odometry)
+
+    beacons = kinds.add_parser(
+        "beacons",
+        help="where the beacons are on the robot, and how far apart, from surveys under roof cameras",
+        description="Corrects [beacons] by where roof cameras saw them while the robot stood turned differently; the"
+        " rig stays within its priors. Their heights stay as measured.",
+    )
+    _add_surveys(beacons)
+    beacons.add_argument("--picture", type=Path, metavar="PNG", help="also draw the beacons and their residuals")
+    beacons.set_defaults(run=_run_beacons)
 
 
 def add_calibrate_time(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -68,8 +80,27 @@ def add_calibrate_time(kinds: argparse._SubParsersAction[argparse.ArgumentParser
         "--recording", type=Path, metavar="MCAP", help="if it is not where data.json says, or beside it"
     )
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="gets [stamp_offsets] (default: only report)")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw how views and wheels turned")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=_run_time)
+
+
+def add_calibrate_flash(kinds: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The arguments of `robotd-solver calibrate flash`."""
+    parser = kinds.add_parser(
+        "flash",
+        help="how labels flash, from a recording of one that does",
+        description="FOLDER is what `robotctl calibrate flash` made: its data.json names the recording. What comes out"
+        " is a line for [mission.identify] of robotd.toml.",
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument(
+        "--recording", type=Path, metavar="MCAP", help="if it is not where data.json says, or beside it"
+    )
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="the camera's curve (default: gamma 2.2)")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the light over the period")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=_run_flash)
 
 
 def _add_surveys(parser: argparse.ArgumentParser) -> None:
@@ -94,6 +125,18 @@ def _run_odometry(arguments: argparse.Namespace) -> int:
     from .rig_tool import run_odometry
 
     return run_odometry(arguments)
+
+
+def _run_beacons(arguments: argparse.Namespace) -> int:
+    from .rig_tool import run_beacons
+
+    return run_beacons(arguments)
+
+
+def _run_flash(arguments: argparse.Namespace) -> int:
+    from .flash_tool import run
+
+    return run(arguments)
 
 
 def _run_time(arguments: argparse.Namespace) -> int:

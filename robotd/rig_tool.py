@@ -1,4 +1,4 @@
-"""`robotd-solver calibrate rig` and `calibrate odometry`: extrinsics, beacons and wheels from surveys."""
+"""`robotd-solver calibrate rig`, `odometry` and `beacons`: extrinsics, wheels and beacons from surveys."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from .config import Calibration, collect, load_calibration, save_rig, save_wheels
+from .config import Calibration, collect, load_calibration, save_beacons, save_rig, save_wheels
 from .errors import InputError, SolverError
 from .files import check_survey, load_points, load_survey, write_atomic
 from .odometry import Wheels
 from .records import KnownLabel, Priors, Survey
 from .roof.setup import load_calibrations, save_calibration
-from .solver.calibrate_rig import Bounds, RigCalibration, calibrate_rig, merge, sphere
+from .solver.calibrate_rig import LEAST_SEEN, Bounds, RigCalibration, calibrate_rig
 from .solver.rig_picture import draw_rig
 from .solver.rig_report import report
+from .solver.rig_start import merge, sphere
+from .solver.survey_pictures import draw_beacons, draw_moves
 
 LEAST_PRIOR = (2e-4, 2e-4)  # radians, metres: mounts bend by as much
 APPLIED = "corrected from the moves of"
@@ -54,7 +56,9 @@ def run_rig(arguments: argparse.Namespace) -> int:
         )
         priors = Priors(camera_rotation_rad=float(f"{turn:.2g}"), camera_translation_m=float(f"{shift:.2g}"))
         cameras = [camera.model for camera in result.cameras]
-        save_rig(cameras, result.beacons, arguments.calibration, priors)
+        save_rig(cameras, arguments.calibration, priors)
+        if result.beacons:
+            save_beacons(result.beacons, max(result.beacon_sigmas.values()), arguments.calibration)
     if arguments.roof_calibration is not None:
         for roof in result.roofs:
             known = load_calibrations(arguments.roof_calibration)[roof.name]
@@ -87,6 +91,8 @@ def run_odometry(arguments: argparse.Namespace) -> int:
     result = calibrate_rig(survey, free=False)
     if result.scale.value is None and result.turn.value is None:
         raise SolverError("the survey shows neither distances nor turns; measure two labels and turn between stops")
+    if arguments.picture is not None:
+        draw_moves(arguments.picture, result)
     if arguments.calibration is not None:
         made = f"{survey.survey} {survey.created or ''}".strip()
         if f"{APPLIED} {made}\n" in _words(arguments):
@@ -95,6 +101,39 @@ def run_odometry(arguments: argparse.Namespace) -> int:
             )
         save_wheels(corrected(before.wheels, result), arguments.calibration, f"{APPLIED} {made}")
     return _tell(arguments, result, before)
+
+
+def run_beacons(arguments: argparse.Namespace) -> int:
+    """Run `calibrate beacons`; returns the exit code. Raises as `run_rig`."""
+    survey, before = _inputs(arguments)
+    _check_beacons(survey)
+    result = calibrate_rig(survey, free=False)
+    if arguments.picture is not None:
+        draw_beacons(arguments.picture, result)
+    if arguments.calibration is not None:
+        save_beacons(result.beacons, max(result.beacon_sigmas.values()), arguments.calibration)
+    return _tell(arguments, result, before)
+
+
+def _check_beacons(survey: Survey) -> None:
+    """Raise SolverError that names all that is missing for beacons to be found."""
+    lacks = []
+    if not survey.rig.beacons:
+        lacks.append("its rig has no beacons: put their places, by tape, into [beacons] of the calibration, and survey")
+    if not survey.roof_cameras:
+        lacks.append("it has no roof cameras: survey where `robotd-solver roof watch` sees the robot")
+    stops = dict.fromkeys(survey.rig.beacons, 0)
+    for stop in survey.stops:
+        for name in {sighting.beacon for sighting in stop.beacon_sightings} & stops.keys():
+            stops[name] += 1
+    if survey.roof_cameras:
+        lacks += [
+            f"beacon {name} was seen at {count} stops; {LEAST_SEEN} or more are needed, turned differently"
+            for name, count in stops.items()
+            if count < LEAST_SEEN
+        ]
+    if lacks:
+        raise SolverError("the survey does not show the beacons: " + "; ".join(lacks))
 
 
 def _words(arguments: argparse.Namespace) -> str:
@@ -148,10 +187,7 @@ def _tell(arguments: argparse.Namespace, result: RigCalibration, before: Calibra
     words = report(result)
     if arguments.report is not None:
         write_atomic(arguments.report, words.encode())
-    if arguments.json:
-        print(json.dumps(_summary(result)))
-    else:
-        print(words, end="")
+    print(json.dumps(_summary(result)) if arguments.json else words, end="\n" if arguments.json else "")
     if arguments.calibration is None:
         _say("nothing was written; --calibration FILE gets the result")
     else:

@@ -21,7 +21,7 @@ from . import workbench_tool
 from .errors import InputError, RobotdError
 from .lens_commands import add_calibrate_camera, metres
 from .plan_tool import add_plan
-from .rig_commands import add_calibrate_rig, add_calibrate_time
+from .rig_commands import add_calibrate_flash, add_calibrate_rig, add_calibrate_time
 from .roof_commands import add_calibrate_roof, add_roof
 
 if TYPE_CHECKING:
@@ -159,6 +159,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     add_calibrate_rig(kinds)
     add_calibrate_roof(kinds)
     add_calibrate_time(kinds)
+    add_calibrate_flash(kinds)
 
 
 def _board(text: str) -> tuple[int, int]:

@@ -16,6 +16,7 @@ from .files import read_bytes
 from .recording import read_contents, read_frames
 from .records import Floats
 from .solver.calibrate_time import Lateness, lateness, view_turns
+from .solver.time_picture import draw_lateness
 
 FORMAT = "robotd-calibration-data/1"
 
@@ -52,8 +53,12 @@ def run(arguments: argparse.Namespace) -> int:
     if not found:
         raise SolverError("; ".join(doubts) or f"{recording}: it has no camera's frames")
     offsets = {camera: before.stamp_offsets.get(camera, 0.0) + offset for camera, (_, offset) in found.items()}
+    if arguments.picture is not None:
+        draw_lateness(arguments.picture, {camera: late for camera, (late, _) in found.items()})
     if arguments.calibration is not None:
-        save_stamp_offsets({**before.stamp_offsets, **offsets}, arguments.calibration)
+        each = ", ".join(f"{camera} +- {1e3 * late.sigma:.1f} ms" for camera, (late, _) in found.items())
+        note = f"robotd-solver calibrate time: {each}"
+        save_stamp_offsets({**before.stamp_offsets, **offsets}, arguments.calibration, note)
     if arguments.json:
         print(json.dumps({camera: _summary(late, offsets[camera]) for camera, (late, _) in found.items()}))
     else:

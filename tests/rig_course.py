@@ -43,33 +43,50 @@ WORLD = World(reflections=0.0, wrong_ids=0.0, slip=0.0)
 ROOF_BEACONS = {"front": (0.104, 0.003, 0.65), "rear": (-0.103, -0.002, 0.65)}  # where they really are
 CIRCLE = tuple((0.0, 0.5 * np.pi * k) for k in range(4))  # metres on along the line, and turned against it
 STEP_AND_TURN = ((0.0, 0.0), (0.15, 0.0), (0.15, 2.0 * np.pi / 3.0), (0.15, -2.0 * np.pi / 3.0))
+OUT_AND_BACK = ((0.0, 0.0), (0.25, 0.0), (0.25, np.pi), (0.0, np.pi))  # what `robotctl calibrate rig` drives
 STRAIGHT_ON = ((0.0, 0.0),)
 
 
-def visits(store, places, pattern):
-    """(S, 3) poses of stops, at each of some places along the line one pattern; their points of the line, and turns."""
+def visits(store, places, pattern, crosswise=False):
+    """Stops at some places along the line, one pattern at each.
+
+    Their (S, 3) poses, the points of the line that they lie at, and how they are turned against it; with `crosswise`
+    every second place's pattern is turned by 90 degrees, across the line.
+    """
     poses, arc = path_of(store["line"])
     start = np.linspace(0.02 * arc[-1], 0.93 * arc[-1], places)
-    where = (start[:, None] + [on for on, _ in pattern]).ravel()
-    turned = np.tile([turn for _, turn in pattern], places)
-    index = [int(np.argmin(np.abs(arc - a))) for a in where]
+    on = np.tile([on for on, _ in pattern], places)
+    beside = np.repeat(crosswise & (np.arange(places) % 2 == 1), len(pattern))
+    index = np.argmin(np.abs(arc - (np.repeat(start, len(pattern)) + np.where(beside, 0.0, on))[:, None]), axis=1)
+    turned = np.tile([turn for _, turn in pattern], places) + 0.5 * np.pi * beside
     result = poses[index]
+    across = result[:, 2] + 0.5 * np.pi
+    result[:, :2] += (beside * on)[:, None] * np.column_stack([np.cos(across), np.sin(across)])
     result[:, 2] += turned
     return result, index, turned
 
 
 def steps_between(before, after, turned, line):
-    """Small relative steps (K, 2) of travel and turn from one stop to the next: on the spot, or along the line."""
+    """Small relative steps (K, 2) of travel and turn from one stop to the next, always forward.
+
+    Along the line, of which the direction may be against the line's own, or straight; turned by `turned` before and
+    after.
+    """
 
     def turn(angle):
         count = max(2, int(abs(angle) / 0.05))
         return np.column_stack([np.zeros(count), np.full(count, angle / count)])
 
-    if line is None:
+    if line is not None:
+        d = np.diff(line, axis=0)
+        along = np.column_stack([np.hypot(d[:, 0], d[:, 1]), d[:, 2]])
+        return np.concatenate([turn(wrap_angle(-turned[0])), along, turn(wrap_angle(turned[1]))])
+    way = after[:2] - before[:2]
+    if np.hypot(*way) < 1e-3:
         return turn(wrap_angle(after[2] - before[2]))
-    d = np.diff(line, axis=0)
-    along = np.column_stack([np.hypot(d[:, 0], d[:, 1]), d[:, 2]])
-    return np.concatenate([turn(wrap_angle(-turned[0])), along, turn(wrap_angle(turned[1]))])
+    course = np.arctan2(way[1], way[0])
+    ahead = np.column_stack([np.full(10, np.hypot(*way) / 10.0), np.zeros(10)])
+    return np.concatenate([turn(wrap_angle(course - before[2])), ahead, turn(wrap_angle(after[2] - course))])
 
 
 def measured(steps, world, scale, base, rng):
@@ -103,6 +120,7 @@ def rig_survey(
     seed=0,
     places=5,
     pattern=STEP_AND_TURN,
+    crosswise=False,
     world=WORLD,
     known=0,
     sigma=0.003,
@@ -118,7 +136,7 @@ def rig_survey(
     share of sightings that are wrong, half of them images in glass or floor, half under another label's name.
     """
     rng, spoiler = np.random.default_rng([seed, 77]), np.random.default_rng([seed, 78])
-    poses, index, turned = visits(store, places, pattern)
+    poses, index, turned = visits(store, places, pattern, crosswise)
     dense, _ = path_of(store["line"])
     truth_rig = make_rig()
     cameras = true_cameras(truth_rig, world, rng)
@@ -158,8 +176,11 @@ def rig_survey(
                 sightings.append(Sighting(camera.name, name, *map(float, place), max(world.centroid_px, 0.1), 0.99))
         move = None
         if k:
-            line = dense[index[k - 1] : index[k] + 1] if index[k] > index[k - 1] else None
-            move = measured(steps_between(poses[k - 1], pose, turned[k - 1 : k + 1], line), world, scale, base, rng)
+            line, against = dense[index[k - 1] : index[k] + 1] if index[k] > index[k - 1] else None, 0.0
+            if index[k] < index[k - 1]:
+                line, against = dense[index[k] : index[k - 1] + 1][::-1], np.pi
+            steps = steps_between(poses[k - 1], pose, turned[k - 1 : k + 1] - against, line)
+            move = measured(steps, world, scale, base, rng)
             odometry = se2_compose(odometry, [move.dx, move.dy, move.dheading])
         beacons = []
         for name, at in ROOF_BEACONS.items() if roofs else ():

@@ -14,8 +14,9 @@ from robotd.geometry.homography import apply
 from robotd.geometry.transforms import rotation_matrix, rotation_vector
 from robotd.odometry import Wheels
 from robotd.roof.setup import RoofCalibration, load_calibrations, save_calibration as save_roof
-from robotd.solver.calibrate_rig import Bounds, calibrate_rig, camera_to_camera, merge, sphere
+from robotd.solver.calibrate_rig import Bounds, calibrate_rig, camera_to_camera
 from robotd.solver.rig_report import report
+from robotd.solver.rig_start import merge, sphere
 from robotd.solver_main import main
 from tests.rig_course import CIRCLE, ROOF_BEACONS, STRAIGHT_ON, WORLD, rig_survey
 from tests.store_surveys import load, with_sightings
@@ -196,7 +197,8 @@ def test_the_commands_write_the_calibration_that_the_robot_reads(tmp_path, capsy
     assert "was calibrated anew since the survey" in capsys.readouterr().err
     assert (tmp_path / "rig.png").read_bytes()[:4] == b"\x89PNG"
     save_survey(replace(survey, rig=after.rig, priors=after.priors), tmp_path / "s.json")
-    assert main(["calibrate", "odometry", *common]) == 0
+    assert main(["calibrate", "odometry", *common, "--picture", str(tmp_path / "moves.png")]) == 0
+    assert (tmp_path / "moves.png").read_bytes()[:4] == b"\x89PNG"
     odometry = json.loads(capsys.readouterr().out)["odometry"]
     wheels = load_calibration(tmp_path / "c.toml").wheels
     assert wheels.scale_left == wheels.scale_right == pytest.approx(factors[0], abs=0.008)
@@ -206,3 +208,31 @@ def test_the_commands_write_the_calibration_that_the_robot_reads(tmp_path, capsy
     assert wheels.base == pytest.approx(Wheels().base * factors[0] / factors[1], abs=4.0 * sigma)
     assert main(["calibrate", "odometry", *common]) == 2
     assert "was corrected from rig" in capsys.readouterr().err
+
+
+def test_beacons_have_a_command_of_their_own_that_keeps_their_uncertainty(tmp_path, capsys):
+    survey, _, _, _ = course(seed=2, known=30, roofs=True)
+    save_survey(survey, tmp_path / "s.json")
+    save_calibration(Calibration(cameras=survey.rig.cameras, beacons=dict(survey.rig.beacons)), tmp_path / "c.toml")
+    asked = ["calibrate", "beacons", str(tmp_path / "s.json"), "--calibration", str(tmp_path / "c.toml")]
+    assert main([*asked, "--picture", str(tmp_path / "b.png")]) == 0
+    said, after = capsys.readouterr().out, load_calibration(tmp_path / "c.toml")
+    assert "distance of the beacons: 0.20" in said
+    assert "scale_left" not in (tmp_path / "c.toml").read_text() or after.wheels == Calibration().wheels
+    for name, place in ROOF_BEACONS.items():
+        assert after.beacons[name] == pytest.approx(place, abs=4.0 * after.priors.beacon_m)
+    assert 0.0 < after.priors.beacon_m < 0.003
+    assert (tmp_path / "b.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_survey_that_does_not_show_the_beacons_is_told_what_it_lacks(tmp_path, capsys):
+    survey, _, _, _ = course(seed=2, known=30, roofs=True)
+    unseen = tuple(replace(stop, beacon_sightings=()) for stop in survey.stops)
+    for lacking, words in (
+        (replace(survey, stops=unseen, roof_cameras=()), "it has no roof cameras"),
+        (replace(survey, stops=unseen, rig=replace(survey.rig, beacons={})), "its rig has no beacons"),
+        (replace(survey, stops=survey.stops[:2] + unseen[2:]), "beacon front was seen at 2 stops; 3 or more"),
+    ):
+        save_survey(lacking, tmp_path / "s.json")
+        assert main(["calibrate", "beacons", str(tmp_path / "s.json")]) == 1
+        assert words in capsys.readouterr().err

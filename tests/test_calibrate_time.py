@@ -91,7 +91,10 @@ def test_the_command_reads_the_folder_and_writes_the_calibration(tmp_path, capsy
     }
     (tmp_path / "data.json").write_text(json.dumps(data))
     save_calibration(Calibration(row_time_s=1e-4, stamp_offsets={"front": 0.002}), tmp_path / "c.toml")
-    assert main(["calibrate", "time", str(tmp_path), "--calibration", str(tmp_path / "c.toml"), "--json"]) == 0
+    drawn = ["--picture", str(tmp_path / "time.png")]
+    assert main(["calibrate", "time", str(tmp_path), "--calibration", str(tmp_path / "c.toml"), "--json", *drawn]) == 0
+    assert (tmp_path / "time.png").read_bytes()[:4] == b"\x89PNG"
+    assert "# robotd-solver calibrate time: front +- " in (tmp_path / "c.toml").read_text()
     assert json.loads(capsys.readouterr().out)["front"]["late_s"] == pytest.approx(0.03, abs=0.0015)
     # a stamp belongs to the first row's first light: half an exposure and half a picture of rows before what was seen,
     # and what was recorded had been corrected by 2 ms

@@ -13,6 +13,7 @@ from robotd.config import Calibration
 from robotd.errors import DriverFault
 from robotd.recording import read_frames
 from robotd.records import CameraModel, Frame, Transform
+from robotd.solver_main import main as solver
 from robotd.v4l2 import MORE_ROOM, NO_ROOM
 from tests.operated import QUICK, operated
 
@@ -68,7 +69,7 @@ def test_a_picture_without_the_board_is_asked_for_again(tmp_path):
     operated(tmp_path, scenario)
 
 
-def test_the_rig_gets_a_survey_of_turns_on_the_spot_at_places_driven_or_carried_to(tmp_path):
+def test_the_rig_gets_a_survey_of_ways_out_and_back_at_places_driven_or_carried_to(tmp_path):
     level = Transform((-np.pi / 2, 0.0, 0.0), (0.06, 0.0, 0.5))
     calibration = Calibration(cameras=(CameraModel("eye", (64, 48), (30.0, 30.0, 31.5, 23.5), level),))
 
@@ -79,7 +80,7 @@ def test_the_rig_gets_a_survey_of_turns_on_the_spot_at_places_driven_or_carried_
         def answers(prompt):
             return next(metres) if prompt["kind"] == "measure" else None
 
-        result, prompts = await converse(client, answers, what="rig", places=3, headings=2)
+        result, prompts = await converse(client, answers, what="rig", places=3)
         name = result["survey"]
         assert name == "rig-20260302T000000Z"
         assert f"robotd-solver calibrate rig {name}.json" in result["text"]
@@ -91,17 +92,18 @@ def test_the_rig_gets_a_survey_of_turns_on_the_spot_at_places_driven_or_carried_
         ]
         made = await client.call("survey.export", survey=name)
         assert [(stop["leg"], stop["stop"]) for stop in made["stops"]] == [
-            *((1, k) for k in range(1, 7)),
-            *((2, k) for k in range(7, 10)),
+            *((1, k) for k in range(1, 9)),
+            *((2, k) for k in range(9, 13)),
         ]
-        ahead, turned, on = (made["stops"][k]["move"] for k in (1, 2, 3))
-        assert ahead["dx"] == pytest.approx(0.15, abs=0.03)
-        assert ahead["dheading"] == pytest.approx(0.0, abs=0.03)
+        ahead, turned, back, on = (made["stops"][k]["move"] for k in (1, 2, 3, 4))
+        for straight in (ahead, back):
+            assert straight["dx"] == pytest.approx(0.25, abs=0.03)
+            assert straight["dheading"] == pytest.approx(0.0, abs=0.03)
         assert turned["dx"] == pytest.approx(0.0, abs=0.01)
         assert abs(turned["dheading"]) == pytest.approx(np.pi, abs=0.15)
-        assert abs(on["dheading"]) == pytest.approx(np.pi, abs=0.3)
-        assert np.hypot(on["dx"], on["dy"]) == pytest.approx(0.3, abs=0.05)
-        assert made["stops"][6]["move"] is None
+        assert on["dx"] == pytest.approx(-0.3, abs=0.05), "at the end it looks ahead again, and drives on"
+        assert on["dheading"] == pytest.approx(-0.5 * np.pi, abs=0.3), "across, at every second place"
+        assert made["stops"][8]["move"] is None
         assert robot.labels.asked
 
     operated(tmp_path, scenario, calibration=calibration, identify=replace(QUICK, max_slots=1))
@@ -139,7 +141,7 @@ def test_a_flash_is_recorded_from_before_the_label_was_asked(tmp_path):
     operated(tmp_path, scenario)
 
 
-def test_the_pattern_of_a_flashing_label_is_learnt_although_nobody_knows_when_it_began(tmp_path):
+def test_the_pattern_of_a_flashing_label_is_learnt_although_nobody_knows_when_it_began(tmp_path, capsys):
     async def scenario(robot, client):
         begun = now() + 2.8
         publish, rng = robot.eye._publish, np.random.default_rng(2)
@@ -157,8 +159,18 @@ def test_the_pattern_of_a_flashing_label_is_learnt_although_nobody_knows_when_it
         assert pattern["period"] == pytest.approx(1.0, abs=0.01)
         assert np.array(pattern["on"]) == pytest.approx(np.array([[0.0, 0.15], [0.3, 0.45]]), abs=0.034)  # one frame
         assert "[mission.identify] pattern = { period = " in result["text"]
+        folders.append(result["folder"])
 
+    folders = []
     operated(tmp_path, scenario)
+    drawn = tmp_path / "flash.png"
+    assert solver(["calibrate", "flash", folders[0], "--picture", str(drawn)]) == 0
+    out = capsys.readouterr()
+    assert "[mission.identify] pattern = { period = " in out.out
+    assert "edges +-" in out.err
+    assert drawn.read_bytes()[:4] == b"\x89PNG"
+    assert solver(["calibrate", "flash", str(tmp_path)]) == 2
+    assert "data.json" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("moment", ["asked", "driving"])

@@ -141,7 +141,10 @@ COMMANDS: dict[str, tuple[str, str, list[Option]]] = {
         "calibrate.rig",
         [
             (("--places",), {"type": int, "default": 5, "metavar": "N", "help": "default: 5"}),
-            (("--headings",), {"type": int, "default": 3, "metavar": "N", "help": "at each place (default: 3)"}),
+            (
+                ("--headings",),
+                {"type": int, "metavar": "N", "help": "N turns on the spot at each place, not out and back"},
+            ),
         ],
     ),
     "calibrate flash": (

@@ -24,12 +24,11 @@ from ..clock import in_thread, now
 from ..config import save_wheels
 from ..control_socket import Client
 from ..errors import DriverFault, InputError, MissionError
+from ..flash_recording import learn_recorded
 from ..hardware import CameraMode
 from ..plugin import Camera, Labels
-from ..recording import read_frames
 from ..records import Frame, OdometryState, Withdrawal
 from ..rpc import RpcError
-from ..vision.learn_pattern import LearntPattern, learn_pattern
 from ..wheel_calibration import calibrate, summary
 from ..wheel_runs import SOURCE, RunPlan, check_writable, collect
 from .rig_survey import collect_rig
@@ -50,7 +49,7 @@ class Calibration:
     camera: str | None = None
     label: str | None = None
     places: int = ranged(5, minimum=1, maximum=50)
-    headings: int = ranged(3, minimum=2, maximum=12)
+    headings: int | None = ranged(None, minimum=2, maximum=12)
     pictures: int = ranged(12, minimum=1, maximum=200)
     columns: int = ranged(9, minimum=3, maximum=50)
     rows: int = ranged(6, minimum=3, maximum=50)
@@ -299,7 +298,8 @@ async def _flash(operations: Operations, person: _Person, wanted: Calibration) -
     mode, gamma = _mode(operations, camera), robot.assembly.calibration.gamma
     asked = album.data["asked_t"]
     try:
-        learnt = await in_thread(_learn, Path(status["file"]), camera.name, asked, wanted.seconds, mode.exposure, gamma)
+        place = Path(status["file"]), camera.name
+        learnt, _, _ = await in_thread(learn_recorded, *place, asked, wanted.seconds, mode.exposure, gamma)
     except InputError as error:
         return await album.finish(f"recorded {status['file']}, but no pattern was found in it: {error}")
     pattern = learnt.pattern
@@ -311,23 +311,11 @@ async def _flash(operations: Operations, person: _Person, wanted: Calibration) -
     }
     line = learnt.toml().replace("{", "{{").replace("}", "}}")
     sure = f"{100.0 * learnt.confidence:.1f} % sure, edges +- {1e3 * learnt.edge_sigma:.1f} ms"
-    text = f"recorded {status['file']}, described in {{folder}}/data.json\nlearnt, {sure}: [mission.identify] {line}"
+    text = (
+        f"recorded {status['file']}, described in {{folder}}/data.json\nlearnt, {sure}: [mission.identify] {line}\n"
+        "to look at: robotd-solver calibrate flash {folder} --picture flash.png"
+    )
     return await album.finish(text)
-
-
-def _learn(file: Path, camera: str, asked: float, seconds: float, exposure: float, gamma: float) -> LearntPattern:
-    """The pattern in the recording, of which nobody knows when the label began to flash; raises InputError."""
-    frames = [frame for frame in read_frames(file, camera) if frame.t >= asked]
-    problem = InputError("it has no frames")
-    start, length = asked, max(3.0, 0.6 * seconds)
-    while frames and start + length <= frames[-1].t + 0.5:
-        part = [frame for frame in frames if start <= frame.t < start + length]
-        try:
-            return learn_pattern([frame.image for frame in part], [frame.t for frame in part], exposure, gamma)
-        except InputError as error:
-            problem = error
-        start += 0.25 * length
-    raise problem
 
 
 async def _time(operations: Operations, person: _Person, wanted: Calibration) -> Any:

@@ -20,7 +20,7 @@ from ..wheel_runs import Person
 from .spot_moves import stand, straight, turn
 from .table import Operations
 
-STEP_M = 0.15  # short, because that shows best which way is ahead: wheels drift on the way
+STEP_M = 0.25  # shows best which way is ahead: on less, sightings do not tell it; on more, wheels drift
 FARTHEST_M = 3.0  # that it drives between two places
 
 
@@ -34,12 +34,14 @@ class RigSurvey:
     config : MissionConfig
         Of that survey.
     places : int
-    headings : int
-        In which the robot looks at each place: so many steps of a full circle, because then the floor's slope cancels.
+    headings : int or None
+        None drives out and back at each place, with stops at both ends both ways, at every second place across: each
+        point of the floor is stood on in opposite headings, so that its slope cancels, and two straight pieces show
+        which way is ahead. A number instead has a full circle of so many stops on the spot, behind one straight piece.
     """
 
     def __init__(
-        self, operations: Operations, person: Person, config: MissionConfig, places: int, headings: int
+        self, operations: Operations, person: Person, config: MissionConfig, places: int, headings: int | None
     ) -> None:
         robot, self.operations, self.person = operations.robot, operations, person
         self.config, self.places, self.headings = config, places, headings
@@ -68,11 +70,10 @@ class RigSurvey:
         with self.observer:
             for place in range(1, self.places + 1):
                 await self._go(place)
-                await self._stop()
-                await straight(self.operations, STEP_M)
-                for _ in range(self.headings):
-                    await self._stop()
-                    await turn(self.operations, 2.0 * math.pi / self.headings)
+                if self.headings is None:
+                    await self._out_and_back(across=place % 2 == 0)
+                else:
+                    await self._circle(self.headings)
         name, target = self.config.survey, self.operations.robot.assembly.config.robot.calibration
         text = (
             f"{self.made} stops in survey '{name}'; {self._shares()}\n"
@@ -82,13 +83,34 @@ class RigSurvey:
         labels = {camera: sorted(labels) for camera, labels in self.seen.items()}
         return {"text": text, "survey": name, "stops": self.made, "labels": labels}
 
+    async def _out_and_back(self, across: bool) -> None:
+        """Ends where and as it began."""
+        if across:
+            await turn(self.operations, 0.5 * math.pi)
+        await self._stop()
+        await straight(self.operations, STEP_M)
+        await self._stop()
+        await turn(self.operations, math.pi)
+        await self._stop()
+        await straight(self.operations, STEP_M)
+        await self._stop()
+        await turn(self.operations, 0.5 * math.pi if across else math.pi)
+
+    async def _circle(self, headings: int) -> None:
+        await self._stop()
+        await straight(self.operations, STEP_M)
+        for _ in range(headings):
+            await self._stop()
+            await turn(self.operations, 2.0 * math.pi / headings)
+
     async def _go(self, place: int) -> None:
         """To the next place: driven straight ahead, or carried, which begins a new leg."""
         where = "free floor, 0.5 m to all sides, labels 1 to 3 m away"
         if place == 1:
+            does = "there and back" if self.headings is None else f"and turns on the spot in {self.headings} steps"
             await self.person.ready(
                 f"Place 1 of {self.places}: put the robot on {where}. At each place it drives {100 * STEP_M:.0f} cm "
-                f"and turns once on the spot, in {self.headings} steps; stay clear of it."
+                f"{does}; stay clear of it."
             )
             self.leg = await in_thread(self.operations.robot.journal.begin_leg, self.header)
             return
@@ -134,7 +156,9 @@ class RigSurvey:
         for sighting in sightings:
             self.seen.setdefault(sighting.camera, set()).add(sighting.label)
         labels = len({sighting.label for sighting in sightings})
-        await self.person.tell(f"stop {self.made} of {self.places * (1 + self.headings)}: {labels} labels")
+        await self.person.tell(
+            f"stop {self.made} of {self.places * (4 if self.headings is None else 1 + self.headings)}: {labels} labels"
+        )
 
     def _shares(self) -> str:
         """What cameras have in common so far, in words."""
@@ -151,7 +175,7 @@ def _shared(sets: Sequence[set[str]]) -> set[str]:
     return {label for label in every if every.count(label) > 1}
 
 
-async def collect_rig(operations: Operations, person: Person, places: int, headings: int) -> dict[str, Any]:
+async def collect_rig(operations: Operations, person: Person, places: int, headings: int | None) -> dict[str, Any]:
     """Make such a survey; raises InputError or MissionError if the robot has no rig or no labels to look for."""
     robot = operations.robot
     if not robot.assembly.cameras:

@@ -8,14 +8,14 @@ or the thesis's sphere of cameras (equation 18) where there is none.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import InputError, SolverError
+from ..errors import SolverError
 from ..geometry.transforms import rotation_matrix, rotation_vector, transform_record
-from ..records import CameraModel, Floats, Matrix3, Priors, Rig, Sighting, Survey, Vector3
+from ..records import CameraModel, Floats, Matrix3, Priors, Survey, Vector3
 from ..typed_json import many_records
 from .bundle import SQUARE
 from .problem import ODOMETRY, Problem, build_problem, stops_per_label
@@ -26,6 +26,7 @@ from .robust import Optimum, optimise
 LEAST_STOPS = 4
 LEAST_TURN = np.radians(30.0)  # of the robot between two stops, so that cameras exchange what they see
 LEAST_LABELS = 4  # of a camera, each from two stops or by another camera, too: six unknowns, and a few to check them
+LEAST_SEEN = 3  # stops from which roof cameras must see a beacon
 LEAST_SHARED = 3  # labels that two cameras, or a camera and the tape measure, have in common
 MOST_TURN = np.radians(0.5)  # standard deviation of a camera in the rig; a map wants a tenth of it
 MOST_SHIFT = 0.015
@@ -94,6 +95,16 @@ class RoofFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BeaconFit:
+    """What a roof camera saw of beacons: `seen` (N, 2) and `left` (N, 2) px, the residuals; `size` of its picture."""
+
+    name: str
+    size: tuple[int, int]
+    seen: Floats
+    left: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RigCalibration:
     """What a rig's calibration found.
 
@@ -116,6 +127,9 @@ class RigCalibration:
     notes : tuple of str
     slope : float
         Standard deviation of the floor's slope at a stop, as the survey's priors have it, in radians.
+    moves : (M, 3) array
+        What is left of the moves ahead, to the left and turned, in their standard deviations.
+    seen_from_above : tuple of BeaconFit
     """
 
     cameras: tuple[CameraFit, ...]
@@ -131,6 +145,8 @@ class RigCalibration:
     explained: float
     notes: tuple[str, ...]
     slope: float
+    moves: Floats
+    seen_from_above: tuple[BeaconFit, ...]
 
     @property
     def floor_sigma(self) -> float:
@@ -140,75 +156,6 @@ class RigCalibration:
         deviation over the root of the number of stops.
         """
         return self.slope / float(np.sqrt(self.stops))
-
-
-def merge(surveys: Sequence[Survey]) -> Survey:
-    """Surveys of one shop by one robot as legs of one survey.
-
-    Raises
-    ------
-    InputError
-        If their rigs, roof cameras or known labels differ.
-    """
-    first, problems = surveys[0], []
-    stops, known = list(first.stops), {one.label: one for one in first.known_labels}
-    roofs = {roof.name: roof for roof in first.roof_cameras}
-    for survey in surveys[1:]:
-        if survey.rig != first.rig:
-            problems.append(f"surveys {first.survey} and {survey.survey} have different rigs; calibrate them apart")
-        for label in survey.known_labels:
-            if known.setdefault(label.label, label) != label:
-                problems.append(f"survey {survey.survey}: known label {label.label} is elsewhere in another survey")
-        for roof in survey.roof_cameras:
-            if roofs.setdefault(roof.name, roof) != roof:
-                problems.append(f"survey {survey.survey}: roof camera {roof.name} differs in another survey")
-        last = max((stop.leg for stop in stops), default=0)
-        default = survey.sigmas.pixel_px
-        stops += [
-            replace(stop, leg=stop.leg + last, sightings=tuple(_with_sigma(s, default) for s in stop.sightings))
-            for stop in survey.stops
-        ]
-    if problems:
-        raise InputError(*problems)
-    name = "+".join(survey.survey for survey in surveys)
-    every = tuple(known.values()), tuple(roofs.values())
-    return replace(first, survey=name, stops=tuple(stops), known_labels=every[0], roof_cameras=every[1])
-
-
-def _with_sigma(sighting: Sighting, default: float) -> Sighting:
-    return sighting if sighting.sigma_px is not None or default <= 0.0 else replace(sighting, sigma_px=default)
-
-
-def sphere(rig: Rig, headings: Mapping[str, float], radius: float, height: float) -> Rig:
-    """The thesis's sphere of cameras as a nominal rig: all look outward, level, from a circle around the robot's axis.
-
-    Parameters
-    ----------
-    rig : Rig
-        Its lenses and beacons are kept.
-    headings : mapping of camera to radians
-        Which way each looks, counter-clockwise from the robot's front.
-    radius, height : float
-        Metres.
-
-    Raises
-    ------
-    InputError
-        If a camera has no heading or a heading no camera.
-    """
-    names = [camera.name for camera in rig.cameras]
-    problems = [f"camera {name}: no heading is given" for name in names if name not in headings]
-    problems += [f"heading of '{name}': the rig has {', '.join(names)}" for name in headings if name not in names]
-    if problems:
-        raise InputError(*problems)
-    cameras = []
-    for camera in rig.cameras:
-        c, s = np.cos(headings[camera.name]), np.sin(headings[camera.name])
-        T = np.eye(4)
-        T[:3, :3] = np.array([[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]])  # columns: camera's right, down, forward
-        T[:3, 3] = radius * c, radius * s, height
-        cameras.append(replace(camera, T_robot_camera=transform_record(T)))
-    return replace(rig, cameras=tuple(cameras))
 
 
 def calibrate_rig(survey: Survey, bounds: Bounds = Bounds(), *, free: bool = True) -> RigCalibration:
@@ -406,7 +353,8 @@ def _result(
     bounds: Bounds,
 ) -> RigCalibration:
     problem, s = optimum.problem, optimum.adjustment.sightings
-    residual = optimum.adjustment.residuals(optimum.state, SQUARE).residual * s.sigma[:, None]
+    residuals = optimum.adjustment.residuals(optimum.state, SQUARE)
+    residual = residuals.residual * s.sigma[:, None]
     turn, place = relative_sigma(found, bounds.each)
     variance = np.diagonal(found.covariance)
     models = _models(asked.survey.rig.cameras, found)
@@ -445,7 +393,16 @@ def _result(
         0.0,
         (),
         asked.survey.priors.tilt_rad,
+        residuals.move,
+        _from_above(problem, residuals.roof),
     )
+
+
+def _from_above(problem: Problem, residuals: Floats) -> tuple[BeaconFit, ...]:
+    roofs = problem.roofs
+    left = residuals * roofs.sigma[:, None]
+    each = [(roof, roofs.camera == r) for r, roof in enumerate(problem.survey.roof_cameras)]
+    return tuple(BeaconFit(roof.name, roof.size, roofs.uv[own], left[own]) for roof, own in each if own.any())
 
 
 def _factor(value: float, variance: float, prior: float) -> Factor:
@@ -469,7 +426,7 @@ def _beacons(
     given = np.array(list(problem.survey.rig.beacons.values())).reshape(-1, 3)
     for k, name in enumerate(problem.survey.rig.beacons):
         seen = [b for stop in problem.survey.stops for b in stop.beacon_sightings if b.beacon == name]
-        if len(seen) < 3 or len(problem.roofs.stop) == 0:
+        if len(seen) < LEAST_SEEN or len(problem.roofs.stop) == 0:
             continue
         places[name] = (float(found.beacons[k, 0]), float(found.beacons[k, 1]), float(given[k, 2]))
         own = found.covariance[first + 2 * k : first + 2 * k + 2, first + 2 * k : first + 2 * k + 2]

@@ -39,11 +39,13 @@ class ViewTurns:
     shift: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Lateness:
     """What a camera's stamps are later than odometry's, in seconds, with its standard deviation.
 
     `correlation` of the view's turns with the wheels', `frames` that were compared, `rms_px` of what is left of them.
+    `at` (N,) are their stamps in seconds, `seen` and `expected` (N,) px by how much the view moved, and would have by
+    the wheels.
     """
 
     seconds: float
@@ -51,6 +53,9 @@ class Lateness:
     correlation: float
     frames: int
     rms_px: float
+    at: Floats
+    seen: Floats
+    expected: Floats
 
 
 def view_turns(frames: Iterable[Frame]) -> ViewTurns:
@@ -176,7 +181,7 @@ def lateness(turns: ViewTurns, t: Floats, heading: Floats, camera: str) -> Laten
     without = np.array([refined(late, (block != k).astype(np.float64))[0] for k in range(_BLOCKS)])
     sigma = float(np.sqrt((_BLOCKS - 1) * np.mean((without - without.mean()) ** 2)))  # jackknife
     middle = 1.4826 * float(np.median(np.abs(left)))
-    return Lateness(late, sigma, correlation, len(shift), middle)
+    return Lateness(late, sigma, correlation, len(shift), middle, after, shift, shift - left)
 
 
 def _check(turns: ViewTurns, t: Floats, heading: Floats, camera: str) -> None:

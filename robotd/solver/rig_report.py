@@ -45,7 +45,8 @@ def report(result: RigCalibration) -> str:
         lines.append(
             f"roll and pitch rest on the floor, whose slope differs by {np.degrees(result.slope):.2f} degrees from "
             f"stop to stop: {result.stops} stops show them to +- {np.degrees(result.floor_sigma):.3f} degrees at best, "
-            f"{stops} to {np.degrees(_WANTED):.2f}"
+            f"{stops} to {np.degrees(_WANTED):.2f} (better where it stood on each spot in opposite headings, as "
+            "robotctl calibrate rig drives: there the slope cancels)"
         )
     for name, (x, y, _) in result.beacons.items():
         lines.append(f"beacon {name}: x {x:.4f}, y {y:.4f} m, +- {1e3 * result.beacon_sigmas[name]:.1f} mm")
