@@ -159,3 +159,45 @@ def test_an_image_is_not_placed_when_one_sighting_puts_the_label_in_front_of_the
     assert (label.status, label.position) == ("ambiguous", None)
     assert min(np.linalg.norm(np.subtract(c.position, truth["S04"])) for c in label.candidates) < 0.01
     assert "image in glass" in label.reason
+
+
+def only_images(survey, names):
+    """The sightings that `reflected` appended for `names`, without the direct ones."""
+
+    def change(stop):
+        last = {s.label: s for s in stop.sightings}
+        seen = sum(s.label in names for s in stop.sightings) > len(names & last.keys())
+        return [s for s in stop.sightings if s.label not in names or (s is last[s.label] and seen)]
+
+    return with_sightings(survey, change)
+
+
+def test_a_label_that_was_seen_in_glass_only_is_not_placed_behind_it():
+    survey, truth = quiet_room()
+    stops = [s.stop for s in survey.stops]
+    names = ("S02", "S04", "S05", "S06")
+    for name in names:  # their panes are one: the labels hang on one wall
+        survey = reflected(survey, truth, name, stops)
+    both = solve(survey)
+    assert all(label_of(both, name).status == "placed" for name in names)
+    label = label_of(solve(only_images(survey, {"S04"})), "S04")
+    assert (label.status, label.position) == ("ambiguous", None)
+    assert min(np.linalg.norm(np.subtract(c.position, truth["S04"])) for c in label.candidates) < 0.01
+    assert "perhaps an image in glass" in label.reason
+    assert "S02" in label.reason
+
+
+@pytest.mark.parametrize(("stops", "status"), [(2, "ambiguous"), (99, "placed")])
+def test_a_label_far_outside_everything_is_placed_only_if_many_stops_saw_it(stops, status):
+    store = load("room")
+    store["labels"].append({"id": "FAR", "position": [5.5, 0.85, 0.9], "normal": [-1.0, 0.0, 0.0]})
+    store["walls"], store["shelves"] = [], []
+    survey, truth = simulate(store, 1, replace(World(), reach=100.0, reflections=0.0, wrong_ids=0.0))
+    seen = [stop.stop for stop in survey.stops if any(s.label == "FAR" for s in stop.sightings)]
+    kept = {*seen[:1], *seen[-1:]} if stops == 2 else set(seen)
+    near = with_sightings(survey, lambda stop: [s for s in stop.sightings if s.label != "FAR" or stop.stop in kept])
+    label = label_of(solve(near), "FAR")
+    assert label.status == status, label.reason
+    if status == "ambiguous":
+        assert "outside all else" in label.reason
+        assert np.linalg.norm(np.subtract(label.candidates[0].position, truth["FAR"])) < 0.2

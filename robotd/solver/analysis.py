@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 import scipy.special
-from scipy.spatial import ConvexHull, QhullError
 
 from ..records import Floats, Map, Survey, Vector3
 from ..typed_json import many_records
@@ -20,6 +19,7 @@ from .bundle import SQUARE
 from .covariance import frame_covariance
 from .known_labels import SLIPPED
 from .mapping import to_map
+from .panes import outside
 from .placement import segments
 from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Ints, Problem, anchors, build_problem
 from .robust import Optimum, optimise
@@ -230,7 +230,7 @@ def _after(optimum: Optimum, result: Map, scale: float | None) -> list[str]:
     far = []
     for i in placed:
         others = np.vstack([state.points[[j for j in placed if j != i], :2], stops])
-        distance = _outside(others, state.points[i, :2]) if len(placed) <= 500 else 0.0
+        distance = outside(others, state.points[i, :2]) if len(placed) <= 500 else 0.0
         if distance > _OUTSIDE_M:
             far.append(f"{problem.labels[i]} by {distance:.1f} m")
     found += unchecked(problem, problem.sightings.select(optimum.inlier))
@@ -253,14 +253,6 @@ def _doubts(sensors: tuple[Scatter, ...]) -> list[str]:
                 f"{s.sensor}: residuals show {s.stated * s.factor:.3g} {s.unit} where {s.stated:.3g} {s.unit} is stated"
             )
     return found
-
-
-def _outside(others: Floats, point: Floats) -> float:
-    try:
-        hull = ConvexHull(others)
-    except (QhullError, ValueError):
-        return 0.0
-    return float(np.max(hull.equations[:, :2] @ point + hull.equations[:, 2]))
 
 
 def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:

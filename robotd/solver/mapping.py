@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from ..geometry.transforms import pose_array, wrap_angle
 from ..records import (
@@ -31,6 +30,7 @@ from .initial import world_rays
 from .known_labels import on_a_line
 from .linear import solve_linear
 from .misfit import FITS, FITS_NOT, Misfit, is_below_floor, misfit, strained
+from .panes import apart, images, outside
 from .problem import Bools, Problem, Sightings, State, build_problem, stops_per_label
 from .robust import Optimum, optimise
 from .ties import Rival, side_of
@@ -135,7 +135,8 @@ class _Tally:
 
     `row` is its place in the adjustment or -1, `known` in the problem's known labels or -1, `sigma` its largest
     standard deviation, `position` and `covariance` as in the map, the latter by row, `agreeing` and `doubting` sums of
-    its sightings' probabilities, `in_front` (L, 3) see _in_front, `elsewhere` (L,) see _elsewhere.
+    its sightings' probabilities, `in_front` (L, 3) see _in_front, `elsewhere` (L,) see _elsewhere, `in_glass` see
+    _in_glass.
     """
 
     asked_stops: list[int]
@@ -152,6 +153,7 @@ class _Tally:
     in_front: Floats
     image: list[bool]
     elsewhere: Bools
+    in_glass: dict[int, tuple[str, Floats | None]]
 
 
 def _tally(asked: Problem, optimum: Optimum) -> _Tally:
@@ -187,6 +189,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
         in_front=in_front,
         image=image,
         elsewhere=_elsewhere(optimum),
+        in_glass=_in_glass(optimum),
     )
 
 
@@ -241,6 +244,9 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
     if tally.image[i]:
         reason = "perhaps an image in glass: one sighting puts the label nearer; map it from another stop"
         return _ambiguous(optimum, i, label, count, inliers, tally.in_front[i], reason)
+    if i in tally.in_glass:
+        reason, other = tally.in_glass[i]
+        return _ambiguous(optimum, i, label, count, inliers, other, reason)
     return MappedLabel(label, "placed", position, covariance, count, inliers)
 
 
@@ -292,27 +298,42 @@ def _in_front(optimum: Optimum) -> Floats:
     trusted = optimum.adjustment.labels[~np.isfinite(result[optimum.adjustment.labels, 0])]
     around = np.vstack([state.points[trusted, :2], problem.stop_entries(state)[optimum.placed, :2]])
     for i in np.flatnonzero(np.isfinite(result[:, 0])):
-        if _outside(around, state.points[i, :2]) < _OUTSIDE_M:
+        if outside(around, state.points[i, :2]) < _OUTSIDE_M:
             result[i] = np.nan
     return result
 
 
-def _outside(around: Floats, point: Floats) -> float:
-    """Metres by which a point lies outside the convex hull of others (N, 2); 0 if there is no hull."""
-    try:
-        hull = ConvexHull(around)
-    except (QhullError, ValueError):  # fewer than three, or all on one line
-        return 0.0
-    return float(np.max(hull.equations[:, :2] @ point + hull.equations[:, 2]))
+def _in_glass(optimum: Optimum) -> dict[int, tuple[str, Floats | None]]:
+    """Labels that were perhaps seen in glass only, why, and the position (3,) that would show there."""
+    problem, state = optimum.problem, optimum.state
+    labels = optimum.adjustment.labels
+    located = np.zeros(len(problem.labels), np.bool_)
+    located[labels] = True
+    result: dict[int, tuple[str, Floats | None]] = {}
+    for i, (position, pane) in images(problem, state, optimum.inlier, located).items():
+        shown = ", ".join(problem.labels[k] for k in pane.labels[:3])
+        result[i] = (
+            f"perhaps an image in glass: behind it, and {shown} are mirrored there; map it from elsewhere",
+            position,
+        )
+    seen = stops_per_label(
+        problem.sightings.label[optimum.inlier], problem.sightings.stop[optimum.inlier], len(problem.labels)
+    )
+    few = seen[labels] < _TRUSTED_STOPS
+    stops = problem.stop_entries(state)[optimum.placed, :2]
+    for row, far in apart(state.points[labels, :2], few, stops).items():
+        reason = f"perhaps an image in glass: few stops saw it, {far:.1f} m outside all else; map it from another stop"
+        result.setdefault(int(labels[row]), (reason, None))
+    return result
 
 
 def _ambiguous(
-    optimum: Optimum, i: int, label: str, count: int, inliers: int, other: Floats, reason: str | None = None
+    optimum: Optimum, i: int, label: str, count: int, inliers: int, other: Floats | None, reason: str | None = None
 ) -> MappedLabel:
     problem, state = optimum.problem, optimum.state
     mine = Adjustment(problem, problem.sightings.select(problem.sightings.label == i))
     candidates = []
-    for point in (state.points[i], other):
+    for point in (state.points[i],) if other is None else (state.points[i], other):
         points = state.points.copy()
         points[i] = point
         linear = mine.residuals(replace(state, points=points), SQUARE)
@@ -320,7 +341,7 @@ def _ambiguous(
         cost = 0.5 * np.minimum((linear.residual**2).sum(axis=1), OUTLIER).sum()
         candidates.append(Candidate(_vector(point), float(cost)))
     candidates.sort(key=lambda c: c.cost)
-    distance = float(np.linalg.norm(np.subtract(candidates[0].position, candidates[1].position)))
+    distance = float(np.linalg.norm(np.subtract(candidates[0].position, candidates[-1].position)))
     theirs = [name for name in (_label_at(optimum, i, c.position) for c in candidates) if name is not None]
     if theirs and reason is None:
         reason = f"conflicting identities: some of its sightings are those of {theirs[0]}; flash both again, alone"
