@@ -5,14 +5,14 @@ cdef class Bundle(Descent):
     """A least-squares problem; arrays are those of robotd.solver.bundle.Adjustment."""
 
     def covariance(self, const double[::1] frame, const double[:, ::1] points):
-        """Covariances at a least-squares optimum: points (l, 3, 3), stops (S, 3, 3), leverages (N,).
+        """Covariances at a least-squares optimum: points (l, 3, 3), stops (S, 3, 3), predictions (N, 3).
 
         None if the matrix is too nearly singular for its factor to be trusted.
         """
         cdef Shape loss
         cdef double[:, :, ::1] of_points = np.empty((self.labels, 3, 3))
         cdef double[:, :, ::1] of_stops = np.zeros((self.stops, 3, 3))
-        cdef double[::1] leverage = np.zeros(self.count)
+        cdef double[:, ::1] predicted = np.zeros((self.count, 3))
         cdef double[:, :, ::1] by_frame = np.zeros((self.count, 2, 15))
         cdef double[:, :, ::1] by_point = np.zeros((self.count, 2, 3))
         cdef uint8_t[::1] seen = np.empty(self.count, dtype=np.uint8)
@@ -46,8 +46,8 @@ cdef class Bundle(Descent):
                 self._sightings(
                     self.points, &loss, NULL, &residual[0, 0], &seen[0], &by_frame[0, 0, 0], &by_point[0, 0, 0]
                 )
-        self._of_points(&Z[0], &of_points[0, 0, 0], &leverage[0], &by_frame[0, 0, 0], &by_point[0, 0, 0])
-        return np.asarray(of_points), np.asarray(of_stops), np.asarray(leverage)
+        self._of_points(&Z[0], &of_points[0, 0, 0], &predicted[0, 0], &by_frame[0, 0, 0], &by_point[0, 0, 0])
+        return np.asarray(of_points), np.asarray(of_stops), np.asarray(predicted)
 
     cdef bint _doubtful(self) noexcept nogil:
         """Whether some pivot lost nearly all digits of its diagonal entry."""
@@ -73,10 +73,10 @@ cdef class Bundle(Descent):
         return False
 
     cdef int _of_points(
-        self, const double* Z, double* of_points, double* leverage, const double* by_frame, const double* by_point
+        self, const double* Z, double* of_points, double* predicted, const double* by_frame, const double* by_point
     ) except -1:
         """Covariances of the points, and what every sighting's own prediction is uncertain by."""
-        cdef int l, e, f, i, j, k, r, c, most = 0, we, wf, entries, base, width, offset
+        cdef int l, e, f, i, j, k, r, c, s, most = 0, we, wf, entries, base, width, offset
         cdef Arena scratch = Arena()
         for l in range(self.labels):
             most = max(most, self.entry_begin[l + 1] - self.entry_begin[l])
@@ -87,10 +87,11 @@ cdef class Bundle(Descent):
         cdef double full[225]
         cdef double P[9]
         cdef double M[9]
-        cdef double J[15]
+        cdef double J[30]
         cdef double coupled[45]
         cdef const double* V
         cdef const double* W
+        cdef const double* p
         cdef double total
         for l in range(self.labels):
             base, entries = self.entry_begin[l], self.entry_begin[l + 1] - self.entry_begin[l]
@@ -159,21 +160,21 @@ cdef class Bundle(Descent):
                                 j = self.active[STOP * self.obs_stop[k] + i]
                             else:
                                 j = 5 + self.active[STOP * self.stops + CAMERA * self.obs_camera[k] + i]
-                            J[offset] = by_frame[30 * self.source[k] + 15 * r + j]
+                            J[15 * r + offset] = by_frame[30 * self.source[k] + 15 * r + j]
                             offset += 1
+                p = by_point + 6 * self.source[k]
+                for s in range(3):  # u with u, v with v, u with v
+                    r, c = s % 2, min(s, 1)
                     total = 0.0
                     for i in range(width):
                         for j in range(width):
-                            total += J[i] * full[15 * i + j] * J[j]
+                            total += J[15 * r + i] * full[15 * i + j] * J[15 * c + j]
                         for j in range(3):
-                            total += 2.0 * J[i] * coupled[3 * i + j] * by_point[6 * self.source[k] + 3 * r + j]
+                            total += coupled[3 * i + j] * (J[15 * r + i] * p[3 * c + j] + J[15 * c + i] * p[3 * r + j])
                     for i in range(3):
                         for j in range(3):
-                            total += (
-                                by_point[6 * self.source[k] + 3 * r + i] * P[3 * i + j]
-                                * by_point[6 * self.source[k] + 3 * r + j]
-                            )
-                    leverage[self.source[k]] += total
+                            total += p[3 * r + i] * P[3 * i + j] * p[3 * c + j]
+                    predicted[3 * self.source[k] + s] = total
         return 0
 
     cdef inline int _entry_width(self, int label, int entry) noexcept nogil:

@@ -197,7 +197,7 @@ def test_covariances_are_those_of_the_dense_inverse(priors, world):
     ours, theirs = covariance(adjustment, state), covariance_reference(adjustment, state)
     np.testing.assert_allclose(ours.points, theirs.points, rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(ours.stops, theirs.stops, rtol=1e-5, atol=1e-10)
-    np.testing.assert_allclose(ours.leverage, theirs.leverage, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(ours.prediction, theirs.prediction, rtol=1e-5, atol=1e-6)
 
 
 def test_covariances_hold_for_many_stops_in_a_loop():

@@ -10,7 +10,7 @@ from robotd.solver.analysis import analyse
 from robotd.solver.growing import GrowingMap
 from robotd.solver.problem import build_problem
 from robotd.solver.ties import weak_ties
-from tests.store_surveys import World, load, quiet_room, simulate, with_sightings
+from tests.store_surveys import World, load, nees, quiet_room, simulate, with_sightings
 
 WORLD = World(reflections=0.0, wrong_ids=0.0)
 
@@ -78,3 +78,13 @@ def test_a_map_that_grows_reports_the_same_tie():
     growing = GrowingMap(replace(survey, stops=survey.stops[:-1]))
     growing.add_stop(survey.stops[-1])
     assert [m.status for m in growing.map().labels] == [m.status for m in solve(survey).labels]
+
+
+def test_a_wrong_name_that_ties_two_rooms_by_itself_is_left_out():
+    """Its residual is as small as any: it turned a whole room towards itself."""
+    survey, truth = simulate(load("warehouse"), 5047, World())
+    result = solve(survey)
+    values = nees(result, truth)
+    assert np.mean(values) < 2.5  # 35 with it
+    tie = next(s for s in result.sightings if (s.stop, s.camera, s.label) == (1, "rear", "B40"))
+    assert tie.weight == 0.0

@@ -17,13 +17,13 @@ from ..records import Floats, Map, Survey, Vector3
 from ..typed_json import many_records
 from .bundle import SQUARE
 from .covariance import frame_covariance
-from .known_labels import SLIPPED
 from .mapping import to_map
 from .panes import outside
 from .placement import segments
 from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Ints, Problem, anchors, build_problem
 from .robust import Optimum, optimise
 from .ties import unchecked
+from .wheel_errors import SLIPPED
 
 JOINING = 3  # shared labels that join two parts of a survey, as in placement
 _LEVEL_M = 0.05  # a label is at camera height within this

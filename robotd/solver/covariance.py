@@ -11,21 +11,40 @@ from ..records import Floats
 from .bundle import SQUARE, Adjustment
 from .problem import State
 
+_CHECKED = 1e-3  # share of a variance that others check, from which a residual says something
 _MOST_COLUMNS = 6000  # of a dense inverse: 300 MB
 _MOST_ENTRIES = 20_000_000  # of one dense temporary array: 160 MB
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariance:
-    """`points` (l, 3, 3) for the adjustment's labels, `stops` (S, 3, 3) of x, y, heading, and `leverage` (N,).
+    """`points` (l, 3, 3) for the adjustment's labels, `stops` (S, 3, 3) of x, y, heading, and `prediction` (N, 3).
 
-    The leverage h of a sighting is the trace of its prediction's covariance in units of its variance: its expected
-    squared residual is 2 - h, so that one with leverage 2 is not checked by any other.
+    The last is the covariance of every sighting's prediction in units of its variance: of u, of v, and of both.
     """
 
     points: Floats
     stops: Floats
-    leverage: Floats
+    prediction: Floats
+
+    @property
+    def leverage(self) -> Floats:
+        """(N,) trace h of the predictions' covariances.
+
+        A sighting's expected squared residual is 2 - h, so that one with leverage 2 is not checked by any other.
+        """
+        return np.clip(self.prediction[:, 0] + self.prediction[:, 1], 0.0, 2.0)
+
+    def studentised(self, residual: Floats) -> Floats:
+        """(N,) squared whitened residuals (N, 2), each over the variance that it has of its own.
+
+        A sighting on which much hangs draws the optimum to itself, however wrong it is: its residual stays small, but
+        its variance is smaller still. Directions that no other sighting checks count for nothing.
+        """
+        uu, vv, uv = (1.0 - self.prediction[:, 0], 1.0 - self.prediction[:, 1], -self.prediction[:, 2])
+        values, vectors = np.linalg.eigh(np.stack([uu, uv, uv, vv], axis=-1).reshape(-1, 2, 2))
+        along = np.einsum("nij,ni->nj", vectors, residual)
+        return np.asarray(np.where(values > _CHECKED, along**2 / np.maximum(values, _CHECKED), 0.0).sum(axis=1))
 
 
 def covariance(adjustment: Adjustment, state: State) -> Covariance:
@@ -34,8 +53,7 @@ def covariance(adjustment: Adjustment, state: State) -> Covariance:
     found = None if kernel is None else kernel.covariance(state.frame, state.points[adjustment.labels])
     if found is None:  # also where the matrix is nearly singular, because eigenvalues tell what is barely known
         return covariance_reference(adjustment, state)
-    points, stops, leverage = found
-    return Covariance(points, stops, np.clip(leverage, 0.0, 2.0))
+    return Covariance(*found)
 
 
 def covariance_reference(adjustment: Adjustment, state: State) -> Covariance:
@@ -66,12 +84,15 @@ def covariance_reference(adjustment: Adjustment, state: State) -> Covariance:
         entries = columns[5 * f : 5 * f + 3]
         stops[f] = padded[np.ix_(entries, entries)]
     A, B = linear.by_frame, linear.by_point
-    leverage = (
-        np.einsum("nri,nij,nrj->n", A, padded[mine[:, :, None], mine[:, None, :]], A, optimize=True)
-        + 2.0 * np.einsum("nri,nij,nrj->n", A, coupled, B, optimize=True)
-        + np.einsum("nri,nij,nrj->n", B, points[adjustment.point], B, optimize=True)
+    crossed = np.einsum("nri,nij,nsj->nrs", A, coupled, B, optimize=True)
+    predicted = (
+        np.einsum("nri,nij,nsj->nrs", A, padded[mine[:, :, None], mine[:, None, :]], A, optimize=True)
+        + crossed
+        + crossed.transpose(0, 2, 1)
+        + np.einsum("nri,nij,nsj->nrs", B, points[adjustment.point], B, optimize=True)
     )
-    return Covariance(0.5 * (points + points.transpose(0, 2, 1)), stops, np.clip(leverage, 0.0, 2.0))
+    prediction = predicted.reshape(-1, 4)[:, [0, 3, 1]]
+    return Covariance(0.5 * (points + points.transpose(0, 2, 1)), stops, prediction)
 
 
 def frame_covariance(adjustment: Adjustment, state: State) -> Floats | None:

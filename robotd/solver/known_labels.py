@@ -10,8 +10,8 @@ import numpy as np
 
 from ..records import Floats
 from .problem import Problem
+from .wheel_errors import SLIPPED
 
-SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # what a slipped move still says: one wheel spun for some centimetres
 _SLIPPING = 0.25  # of the moves, and two, from which known labels are doubted
 _SAME_M = 0.05  # rms to which two sets of positions are the same
 _ANOTHER_SIZE = 0.02

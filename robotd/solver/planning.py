@@ -21,13 +21,13 @@ from ..plan_records import Plan, PlannedFlash, PlannedLabel, PlannedStop
 from ..records import Floats, Map, Pose, Survey
 from ..typed_json import many_records
 from .belief import Rows
-from .known_labels import SLIPPED
 from .mapping import WIDEST_SIGMA_M, to_map
 from .neighbourhood import nearby
 from .outlook import GUESSES_M, Outlook, distances
 from .problem import Ints, build_problem
 from .robust import Optimum, optimise
 from .ways import Way, along_line, over_floor
+from .wheel_errors import SLIPPED
 
 _WRONG_M = 0.5  # error of a position that is wrong
 _APART = 0.35  # of the labels' usual distance lies between two stops: nearer ones see them from almost the same side

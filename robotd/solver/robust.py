@@ -17,11 +17,13 @@ from ..records import Floats
 from .bundle import SQUARE, Adjustment, Loss, Solution
 from .covariance import Covariance, covariance
 from .initial import epipolar_moves, triangulate, world_rays
-from .known_labels import SLIPPED, contradicted, difference, slipped
+from .known_labels import contradicted, difference, slipped
 from .placement import Placement, at_first_stop, detach, place, retriangulate
 from .problem import Bools, Ints, Known, Problem, State, anchors, stops_per_label
+from .tie_sightings import without_ties
 from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
+from .wheel_errors import slip_covariance
 
 _SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
 _WRONG_KNOWN = 25.0
@@ -224,6 +226,7 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         problem = everything.problem
         iterations += spent
         sure = covariance(adjustment, state)
+        adjustment, state, sure, inlier = without_ties(adjustment, state, sure, inlier)
         factor = _excess(adjustment, state, sure) if attempt == 0 else 1.0
         if factor == 1.0:
             break
@@ -314,7 +317,9 @@ def _without_wrong(everything: Adjustment, state: State) -> Problem:
             notes.append(f"{at} is {sigmas:.0f} standard deviations from what all else says; it was not used")
         problem = replace(problem, motions=motions.select(~wrong), notes=tuple(notes))
     if slipped.any():
-        covariance_ = np.where(slipped[:, None, None], moves.covariance + SLIPPED, moves.covariance)
+        covariance_ = np.where(
+            slipped[:, None, None], moves.covariance + slip_covariance(moves.measured), moves.covariance
+        )
         moves = replace(moves, covariance=covariance_)
         for m in np.flatnonzero(slipped):
             stop = problem.survey.stops[moves.after[m]]

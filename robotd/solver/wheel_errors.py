@@ -6,6 +6,7 @@ import numpy as np
 
 from ..records import Floats, Move, Priors
 
+SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # of a slipped move, where it ended: one wheel spun for some centimetres
 _SAME_MOVE_M = 1e-3
 
 
@@ -30,6 +31,20 @@ def move_by_errors(move: Move) -> Floats:
     if not np.allclose(given[:, 0], [move.dx, move.dy, 0.0], rtol=0.0, atol=_SAME_MOVE_M):
         return arc_by_errors(measured)
     return given
+
+
+def slip_covariance(moves: Floats) -> Floats:
+    """(M, 3, 3) of what a slip somewhere on the way of moves (M, 3) adds to their errors.
+
+    A wheel that spins turns the robot, and what is left of the way then leads aside: a turn by a after a share s of the
+    way shifts the end by (1 - s) a times the way, with s anywhere between 0 and 1.
+    """
+    result = np.tile(SLIPPED, (len(moves), 1, 1))
+    aside = np.column_stack([-moves[:, 1], moves[:, 0]])
+    turn = SLIPPED[2, 2]
+    result[:, :2, :2] += turn / 3.0 * aside[:, :, None] * aside[:, None, :]
+    result[:, :2, 2] = result[:, 2, :2] = turn / 2.0 * aside
+    return result
 
 
 def coupling(priors: Priors) -> float:
