@@ -6,7 +6,8 @@ from pathlib import Path
 
 from .errors import InputError
 from .recording import read_frames
-from .vision.learn_pattern import LearntPattern, learn_pattern
+from .vision.learn_pattern import learn_pattern
+from .vision.pattern_fit import LearntPattern
 
 _LEAST_S = 3.0  # of footage from which a pattern is learnt
 

@@ -384,3 +384,13 @@ def test_one_burst_of_light_is_no_period_of_three_flashes():
     matches = Matcher(PATTERNS[0], 0.01, (0.6, 10.0)).match(times, values[:1], np.ones((1, 60), np.float32), NO_SHIFT)
     assert matches.regular[0]
     assert matches.start[0] % 1.0 == pytest.approx(0.7, abs=0.025)
+
+
+def test_short_flashes_that_leave_much_open_are_taken_as_alike():
+    options = Options(PATTERNS[3], seconds=10.0, crowd=0.0)
+    shown = scene(1, 259, options)
+    near = shown.labels[0].u, shown.labels[0].v
+    learnt = learn_pattern(*frames(shown), exposure=shown.exposure, near=near).pattern
+    assert learnt.period == pytest.approx(1.0, abs=1e-3)
+    assert np.ptp([end - start for start, end in learnt.on]) <= 1e-3
+    assert [start for start, _ in learnt.on] == pytest.approx([0.0, 0.2, 0.4], abs=5e-3)

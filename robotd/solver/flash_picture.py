@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..records import Floats
-from ..vision.learn_pattern import LearntPattern
+from ..vision.pattern_fit import LearntPattern
 from .figure import ARROW, INK, MUTED, RING, new_figure, plain, save_figure
 
 _PHASES = 400  # of the period that are tried
