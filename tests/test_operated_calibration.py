@@ -69,6 +69,16 @@ def test_a_picture_without_the_board_is_asked_for_again(tmp_path):
     operated(tmp_path, scenario)
 
 
+def test_a_camera_that_gives_no_picture_fails_the_calibration_and_not_robotd(tmp_path):
+    async def scenario(robot, client):
+        robot.course.bus.frames("eye").publish = lambda frame: None
+        error, _ = await converse(client, what="camera", camera="eye", pictures=1)
+        assert "eye: no frame for 5 s; check the camera" in error["message"]
+        assert (await client.call("status"))["drivers"]
+
+    operated(tmp_path, scenario)
+
+
 def test_the_rig_gets_a_survey_of_ways_out_and_back_at_places_driven_or_carried_to(tmp_path):
     level = Transform((-np.pi / 2, 0.0, 0.0), (0.06, 0.0, 0.5))
     calibration = Calibration(cameras=(CameraModel("eye", (64, 48), (30.0, 30.0, 31.5, 23.5), level),))

@@ -206,15 +206,13 @@ async def _photograph(operations: Operations, camera: Camera) -> Frame:
     """A frame that was exposed after now."""
     t = now()
     with operations.bus.frames(camera.name).subscribe(size=2) as frames:
-        async with asyncio.timeout(FRAME_S) as limit:
-            try:
+        try:
+            async with asyncio.timeout(FRAME_S):
                 while (frame := await frames.get()).t < t:
                     pass
-                return frame
-            except TimeoutError:
-                if limit.expired():
-                    raise DriverFault(f"{camera.name}: no frame for {FRAME_S:g} s; check the camera") from None
-                raise
+        except TimeoutError:
+            raise DriverFault(f"{camera.name}: no frame for {FRAME_S:g} s; check the camera") from None
+        return frame
 
 
 async def _boards(operations: Operations, person: _Person, album: _Album, camera: Camera, count: int, how: str) -> int:

@@ -42,8 +42,11 @@ async def _move(operations: Operations, speed: float, turn_rate: float, amount: 
     control, bus = operations.robot.control, operations.bus
     done, moved = 0.0, now()
     with bus.odometry.subscribe(size=2) as states:
-        async with asyncio.timeout(FRAME_S):
-            before = await states.get()
+        try:
+            async with asyncio.timeout(FRAME_S):
+                before = await states.get()
+        except TimeoutError:
+            raise DriverFault("the base sends no sensor frames") from None
         while done < amount:
             bus.commands.publish(DriveCommand(now(), speed, turn_rate, SOURCE))
             try:
