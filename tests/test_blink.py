@@ -307,6 +307,13 @@ def test_positions_reach_their_stated_sigma_and_twice_the_cramer_rao_bound():
     assert rms / np.mean(sigmas) == pytest.approx(1.0, abs=0.35)
 
 
+def test_a_strong_light_that_is_steep_within_a_cell_is_placed_without_bias():
+    labels = grid_of_lights(np.full(20, 102.0))
+    found, _ = matches(FlashDetector().detect(*shoot(labels, 4.0, texture=5.0)), labels)
+    errors = [(flash.u - label.u, flash.v - label.v) for label, (flash,) in zip(labels, found, strict=True)]
+    assert np.sqrt(np.mean(np.square(errors))) <= 0.006  # the Cramer-Rao bound is 0.003
+
+
 def test_a_flash_of_three_seconds_is_found_wherever_it_falls_in_the_slot():
     rng = np.random.default_rng(5)
     labels = grid_of_lights(np.full(20, 14.0), seed=5, periods=3)

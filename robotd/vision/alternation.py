@@ -204,7 +204,11 @@ class Alternation:
         sloped = cv2.blur(image, (5, 5), scratch)
         cv2.addWeighted(image, 1.0, sloped, _SLOPE, 0.0, sloped)
         peaks = np.flatnonzero((image > least) & (sloped >= cv2.dilate(sloped, np.ones((3, 3), np.uint8))))
-        return peaks[np.argsort(-image.ravel()[peaks], kind="stable")][:most]
+        heights = image.ravel()[peaks]
+        if len(peaks) > most:  # because sorting them all costs more than choosing
+            high = np.sort(np.argpartition(-heights, most)[:most])
+            peaks, heights = peaks[high], heights[high]
+        return np.asarray(peaks[np.argsort(-heights, kind="stable")])
 
     def _usual(self, sums: NDArray[np.int16]) -> tuple[Singles, Singles]:
         """Median of each tile, and one over the spread about it, for every tile row and column (R, w)."""

@@ -219,7 +219,7 @@ class FlashDetector:
                     sigma=float(np.sqrt(0.5 * (uu + vv))),
                     score=track.score,
                     phase=(track.start + spot.v * config.row_time_s) % config.pattern.period,
-                    amplitude=grey_difference(track.base, spot.peak, config.gamma),
+                    amplitude=grey_difference(float(np.median(track.base)), spot.peak, config.gamma),
                     saturated=bool(track.clipped.any()),
                     covariance=(float(uu), float(uv), float(vv)),
                     reflection=float(reflection),
@@ -473,7 +473,7 @@ class FlashDetector:
         """Where a track's light is, in pixels; None if its image is not that of a small light, as people leave it."""
         if track.fitted != track.last:
             assert self._alternation is not None
-            spot = track.fit(self._alternation.shape)
+            spot = track.fit(self._alternation.shape, self.config.gamma)
             if spot is not None:
                 shift = self._shift_sum / max(self._count, 1)
                 least = self.config.max_sigma_px * (_CENSORED if track.clipped.any() else 1.0)

@@ -50,6 +50,23 @@ def grey_difference(base: float, light: float, gamma: float) -> float:
     return float(255.0 * (bright ** (1.0 / gamma) - dark ** (1.0 / gamma)))
 
 
+def grey_mean_bias(spot: Spot, dark: Floats, gamma: float, pitch: int) -> Floats:
+    """Light (K, L) by which cells differ whose grey levels, not their light, are averaged over pitch x pitch pixels.
+
+    `dark` (K, L) is their light without the spot's. The steeper a spot is within a cell, the less its mean grey level.
+    """
+    u, v = (np.arange(size * pitch) for size in dark.shape[::-1])
+    bell_u, bell_v = (np.exp(-0.5 * ((x - at) / spot.width) ** 2) for x, at in ((u, spot.u), (v, spot.v)))
+    added = spot.peak * np.outer(bell_v, bell_u)
+    lit = np.maximum(dark, 0.5).repeat(pitch, axis=0).repeat(pitch, axis=1) + added
+
+    def means(pixels: Floats) -> Floats:
+        rows, columns = dark.shape
+        return np.asarray(pixels.reshape(rows, pitch, columns, pitch).mean(axis=(1, 3)))
+
+    return np.asarray(means(lit ** (1.0 / gamma)) ** gamma - means(lit))
+
+
 def fit_spot(
     image: Floats, variance: Floats, valid: NDArray[np.bool_], pitch: int = 1, start: tuple[float, float] | None = None
 ) -> Spot | None:
