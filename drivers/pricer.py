@@ -117,7 +117,7 @@ class PricerDriver(Driver):
         async with self._turn:
             try:
                 if self._streams is not None:
-                    with suppress(ConnectionError, EOFError):  # the kept connection had died
+                    with suppress(ConnectionError, EOFError, TimeoutError):  # it had died, or a firewall forgot it
                         return await self._exchange(request)
                 return await self._exchange(request)
             except TimeoutError as error:

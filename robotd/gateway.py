@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import errno
 import hmac
 import json
 import math
@@ -46,6 +47,7 @@ LABEL_LIMIT = 500  # labels of one request
 TEXT_PIECE, TEXT_LIMIT = 20_000, 4_000_000  # characters of a list of labels, in one answer and at all
 WAITING_LIMIT = 1000  # instruction files that the label system has not fetched
 CLIENT_LIMIT = 32  # connections
+IDLE_S = 900.0  # after which a silent one is closed: robots that lost their power never say so, and connect anew
 LOG_LIMIT = 4 << 20  # bytes; then the log is put aside as log.1
 KEYS = 10_000  # keys remembered
 RETRY_S = 1.0  # between two looks at files that cannot be moved
@@ -80,6 +82,7 @@ class Outbox:
         self.held: deque[str] = deque()  # names of files that wait for their guard time
         self._latest = -math.inf  # when the latest file went into the folder, in the caller's clock
         self._failed = False  # the latest file could not be written
+        self._lost: set[str] = set()  # names of files that disappeared before their turn
         self.work = folder / ".robotd-labels"
         self.log = self.work / "log"
         self.template = template
@@ -130,12 +133,15 @@ class Outbox:
             self.number += 1
             self.held.append(name)
             self.release(now)
+            if name in self._lost:
+                raise FileNotFoundError(errno.ENOENT, f"{name} was taken away by another program, a virus scanner?")
         except OSError as error:
             if name in self.held:
                 self.held.remove(name)
-            with suppress(OSError):
-                path.unlink()  # a restart must not obey what is refused now,
-                self._note({"file": name, "key": key, "withdrawn": True})  # nor take it for done if it is asked again
+            with suppress(OSError):  # a restart must not obey what is refused now, nor take it for done,
+                self._note({"file": name, "key": key, "withdrawn": True})
+            with suppress(OSError):  # even where a virus scanner still holds the file
+                path.unlink()
             self._failed = True
             raise RefusedError(f"{self.folder} cannot be written: {error.strerror or error}") from error
         self._remember(key)
@@ -143,15 +149,22 @@ class Outbox:
     def release(self, now: float) -> float | None:
         """Move files whose guard time is over into the folder; seconds until the next one is due, None if none waits.
 
-        Raises OSError if one cannot be moved; it waits on.
+        One that another program took away is given up. Raises OSError if one cannot be moved; it waits on.
         """
         while self.held:
             due = self._latest + self.guard_s - now
             if due > 0.0:
                 return due
-            _rename(self.work / self.held[0], self.folder / self.held[0])
+            name = self.held[0]
+            try:
+                _rename(self.work / name, self.folder / name)
+                self._latest = now
+            except FileNotFoundError:
+                if (self.work / name).exists() or not (self.work.is_dir() and self.folder.is_dir()):
+                    raise
+                self._lost.add(name)
+                print(f"robotd-labels: {self.work / name} was taken away; its labels will not flash", file=sys.stderr)
             self.held.popleft()
-            self._latest = now
         return None
 
     def clear(self, now: float) -> None:
@@ -160,9 +173,15 @@ class Outbox:
             return
         there = [name for name in os.listdir(self.folder) if _FILE.fullmatch(name)]
         self._since = {name: self._since.get(name, now) for name in there}
+        failed: OSError | None = None
         for name, since in self._since.items():
             if now >= since + self.clear_s:
-                (self.folder / name).unlink(missing_ok=True)
+                try:
+                    (self.folder / name).unlink(missing_ok=True)
+                except OSError as error:  # on Windows one that is just being read: the others need not wait for it
+                    failed = error
+        if failed is not None:
+            raise failed
 
     def waiting(self) -> int:
         """How many of our files the label system has not fetched yet."""
@@ -179,6 +198,8 @@ class Outbox:
                 f"{waiting} instruction files wait in {self.folder}; is the label system running and watching it? "
                 "If it leaves what it has read, start this program with --clear 60"
             )
+        if not self.work.is_dir():
+            return f"{self.folder} cannot be written: {self.work.name} in it is gone; start this program again"
         if not os.access(self.folder, os.W_OK) or not os.access(self.work, os.W_OK):
             return f"{self.folder} cannot be written; give this program's user the right to"
         return self._still_failing() if self._failed else None
@@ -197,7 +218,7 @@ class Outbox:
         return None
 
     def _note(self, entry: dict[str, Any]) -> None:
-        with suppress(FileNotFoundError):
+        with suppress(OSError):  # there is none yet, or somebody on Windows looks at it: then it grows on
             if self.log.stat().st_size > LOG_LIMIT:
                 os.replace(self.log, self.log.with_suffix(".1"))
         begin = b"" if self._log_is_whole() else b"\n"
@@ -282,14 +303,14 @@ class Gateway:
             if len(self.clients) > CLIENT_LIMIT:
                 writer.write(_answer(None, f"more than {CLIENT_LIMIT} connections; close one"))
                 return
-            while line := await _line(reader):
+            while line := await asyncio.wait_for(_line(reader), IDLE_S):
                 writer.write(self.answer(line, sender, asyncio.get_running_loop().time()))
                 if self.outbox.held:
                     self.held.set()
                 await writer.drain()
         except ValueError:  # asyncio's word for a line beyond the limit: where the next one begins is unknown
             writer.write(_answer(None, f"a line of more than {LINE_LIMIT} bytes; send less"))
-        except (OSError, asyncio.CancelledError):
+        except (OSError, TimeoutError, asyncio.CancelledError):
             pass
         finally:
             self.clients.discard(task)
@@ -498,6 +519,8 @@ def _alone(work: Path) -> Iterator[None]:
 
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
+            if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
+                raise OSError(error.errno, f"no file can be locked there ({error.strerror})", str(work)) from error
             raise BlockingIOError(error.errno, "another robotd-labels serves this folder", str(work.parent)) from None
         yield
 

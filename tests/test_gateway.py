@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import os
 import shutil
@@ -478,6 +479,107 @@ def test_files_that_windows_editors_save_are_read_or_refused_in_words(tmp_path, 
     token.write_bytes("\ufeffA1\n".encode())
     desk = Gateway(Outbox(watched), None, token)
     assert ask(desk, {"method": "labels"})["text"] == "A1\n"
+
+
+def test_a_share_that_knows_no_locks_is_not_taken_for_another_gateway(tmp_path, monkeypatch, capsys):
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(file, how):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    assert main(["--folder", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert "no file can be locked there (No locks available)" in said
+    assert "another" not in said
+
+
+def test_what_a_virus_scanner_holds_is_withdrawn_all_the_same(tmp_path, monkeypatch):
+    def hold(self, *_, **__):
+        raise PermissionError(13, "in use")
+
+    desk = make_desk(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(gateway, "PAUSE_S", 0.0)
+        patch.setattr(os, "replace", hold)
+        patch.setattr(type(tmp_path), "unlink", hold)
+        assert "in use" in ask(desk, {**FLASH, "key": "a"})["error"]
+    again = make_desk(tmp_path)  # a restart neither obeys it nor takes it for done
+    assert files(tmp_path) == {}
+    assert ask(again, {**FLASH, "key": "a"})["ok"]
+    assert len(files(tmp_path)) == 1
+
+
+def test_a_file_that_is_quarantined_does_not_block_those_behind_it(tmp_path, monkeypatch, capsys):
+    outbox = Outbox(tmp_path, guard_s=5.0)
+    outbox.open()
+    for number in range(3):
+        outbox.flash([f"A{number}"], [3], 1.0, None, "me", 100.0 + number)
+    (tmp_path / ".robotd-labels" / "robotd-000000000002.txt").unlink()
+    assert outbox.release(105.0) is None
+    assert [text[6:8] for text in files(tmp_path).values()] == ["A0", "A2"]
+    assert "robotd-000000000002.txt was taken away" in capsys.readouterr().err
+    write = gateway._write
+
+    def scanned(path, mode, data):
+        write(path, mode, data)
+        for file in path.parent.glob("robotd-*.txt"):
+            if path.name == "log":  # which is written after it
+                file.unlink()
+
+    monkeypatch.setattr(gateway, "_write", scanned)
+    with pytest.raises(gateway.RefusedError, match="was taken away by another program"):
+        outbox.flash(["A9"], [3], 1.0, "b", "me", 200.0)
+    assert outbox.waiting() == 2
+
+
+def test_a_file_that_is_being_read_does_not_keep_the_others_in_the_folder(tmp_path, monkeypatch):
+    outbox = Outbox(tmp_path, clear_s=60.0)
+    outbox.open()
+    for _ in range(3):
+        outbox.flash(["A1"], [3], 1.0, None, "me")
+    outbox.clear(0.0)
+    remove = type(tmp_path).unlink
+
+    def one_is_held(self, missing_ok=False):
+        if self.name.endswith("1.txt"):
+            raise PermissionError(13, "in use")
+        remove(self, missing_ok)
+
+    monkeypatch.setattr(type(tmp_path), "unlink", one_is_held)
+    with pytest.raises(PermissionError):
+        outbox.clear(60.0)
+    assert list(files(tmp_path)) == ["robotd-000000000001.txt"]
+
+
+def test_a_log_that_somebody_looks_at_grows_on(tmp_path, monkeypatch):
+    desk = make_desk(tmp_path)
+    monkeypatch.setattr(gateway, "LOG_LIMIT", 10)
+    rename = os.replace
+
+    def held(old, new):
+        if str(new).endswith(".1"):
+            raise PermissionError(13, "in use")
+        rename(old, new)
+
+    monkeypatch.setattr(os, "replace", held)
+    assert all(ask(desk, FLASH)["ok"] for _ in range(3))
+    assert len((tmp_path / ".robotd-labels" / "log").read_text().splitlines()) == 3
+
+
+def test_silent_connections_are_closed_because_dead_robots_would_use_them_up(tmp_path, monkeypatch):
+    async def run():
+        desk = make_desk(tmp_path)
+        server = await asyncio.start_server(desk._connected, "127.0.0.1", 0)
+        streams = await asyncio.open_connection(*server.sockets[0].getsockname())
+        assert await asyncio.wait_for(streams[0].read(), 5.0) == b""
+        streams[1].close()
+        server.close()
+        await asyncio.gather(*desk.clients)
+        assert not desk.clients
+
+    monkeypatch.setattr(gateway, "IDLE_S", 0.01)
+    asyncio.run(run())
 
 
 def test_two_gateways_do_not_serve_one_folder(tmp_path, capsys):

@@ -31,6 +31,7 @@ FIRST_LIGHTS = 60.0  # labels that a stop shows of which nothing is known
 SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput is not known,
 SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
+RECKONED = 0.92  # of a stop's time is reckoned with at first: the rest is for what goes wrong
 FEW_LIGHTS = 3.0  # that a stop may name; where it has no time for more, it asks what it can
 SINGLES = 3  # slots for each label when they are asked one at a time
 ENOUGH_OWED = 0.4  # of the known labels: when the audit owes so many, it gets a slot of its own
@@ -175,7 +176,7 @@ class Inquiry:
         known = self._rng.permutation(np.flatnonzero(candidates.wanted & first))
         others = self._rng.permutation(np.flatnonzero(self._worth_asking() & ~first))
         others = others[np.argsort(candidates.asked[others], kind="stable")]
-        most = self.pace.affordable(len(known), candidates.weights[others], config.stop_s)
+        most = self.pace.affordable(len(known), candidates.weights[others], RECKONED * config.stop_s)
         few = float(candidates.weights[others[:most]].sum()) < FEW_LIGHTS
         if few and not len(known):  # too short a time for names; what can be asked at all may be named later
             most = max(most, 1, int(0.5 * (config.stop_s - self.pace.overhead) / self.delays.interval))
@@ -212,7 +213,7 @@ class Inquiry:
             if worth or owed >= ENOUGH_OWED * len(known) > 0.0:
                 self.audited = audit = np.sort(self._rng.permutation(known)[: int(owed)])
             silent = self._still_there(seen)
-        left = (self._started + config.stop_s - t - self.pace.overhead) / self.delays.interval
+        left = self._started + config.stop_s - t - self.pace.overhead - float(np.mean(config.durations_s))
         if not worth and not len(audit):
             return None
         lists = []
@@ -224,11 +225,12 @@ class Inquiry:
         value[audit] = value[silent] = 1.0
         self._besides = bool(len(audit) + len(silent))
         ask = np.flatnonzero(value)
-        ask = ask[np.argsort(-value[ask], kind="stable")][: max(0, int(left))]
+        ask = ask[np.argsort(-value[ask], kind="stable")][: max(0, int(left / self.delays.interval))]
         if not len(ask):
             return None
         doubt = (1.0 - posterior.probability[undecided]) / np.maximum(posterior.probability[undecided], 1e-9)
-        return self._compose(ask, ask[:0], lists, float(np.median(doubt)) if len(doubt) else 0.0)
+        question = self._compose(ask, ask[:0], lists, float(np.median(doubt)) if len(doubt) else 0.0)
+        return question if float(question.times[-1]) <= left else None  # pauses in the queue may take longer
 
     def _still_there(self, seen: Flags) -> Numbers:
         """Labels without an answer that may be in view rather than hidden, though their flashes were lost.

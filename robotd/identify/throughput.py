@@ -22,13 +22,13 @@ from ..records import Floats
 from .decoder import Evidence, Numbers, Prior, Singles, chances
 from .delays import STAMP_S, TABLE_STEP_S, DelayModel, Kernel
 
-kernel: ModuleType | None
+compiled: ModuleType | None
 try:
     from . import _throughput
 
-    kernel = _throughput
+    compiled = _throughput
 except ImportError:  # built with ROBOTD_NO_EXTENSIONS=1
-    kernel = None
+    compiled = None
 
 LABELS = 1500  # tried for each light, at most
 PAIRS, LIGHTS = 45_000, 12  # pairs of light and label, above which no further light is taken, but so many in any case
@@ -117,10 +117,10 @@ def log_likelihoods(intervals: Floats, odds: Floats, lights: Numbers, answers: A
     answers : Answers
         That the interval decides about.
     """
-    if kernel is None:
+    if compiled is None:
         return reference_log_likelihoods(intervals, odds, lights, answers)
     a, waits, scores = answers, np.zeros(len(answers.gates)), np.zeros(len(intervals))
-    kernel.log_likelihoods(
+    compiled.log_likelihoods(
         intervals,
         odds,
         lights,
