@@ -20,7 +20,7 @@ from ..records import Floats
 from .code import code_words, largest_prime, on_off_words
 from .decoder import Evidence, Numbers, Posterior, Prior, decode, lateness
 from .delays import STAMP_S, DelayModel, turns
-from .pace import SEEN_AFTER, Pace
+from .pace import EARLY, SEEN_AFTER, Pace
 from .settings import FlashRequest, IdentifyConfig
 from .throughput import search_interval
 
@@ -31,7 +31,7 @@ FIRST_LIGHTS = 60.0  # labels that a stop shows of which nothing is known
 SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput is not known,
 SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
-RECKONED = 0.92  # of a stop's time is reckoned with at first: the rest is for what goes wrong
+RECKONED = 0.96  # of a stop's time is reckoned with at first: the rest is for what goes wrong
 FEW_LIGHTS = 3.0  # that a stop may name; where it has no time for more, it asks what it can
 SINGLES = 3  # slots for each label when they are asked one at a time
 ENOUGH_OWED = 0.4  # of the known labels: when the audit owes so many, it gets a slot of its own
@@ -213,7 +213,7 @@ class Inquiry:
             if worth or owed >= ENOUGH_OWED * len(known) > 0.0:
                 self.audited = audit = np.sort(self._rng.permutation(known)[: int(owed)])
             silent = self._still_there(seen)
-        left = self._started + config.stop_s - t - self.pace.overhead - float(np.mean(config.durations_s))
+        left = self._started + config.stop_s - t - EARLY * self.pace.overhead - float(np.mean(config.durations_s))
         if not worth and not len(audit):
             return None
         lists = []
