@@ -38,6 +38,7 @@ ENOUGH_OWED = 0.4  # of the known labels: when the audit owes so many, it gets a
 REFLECTED = 0.3  # probability of labels without a light here, below which a light is a reflection not worth a slot
 STILL_THERE = 0.1  # probability from which a label that did not answer is asked again
 FOREIGN = 0.95  # probability from which a light is no label of ours, and nothing is asked for it
+RIDES = 0.01  # probability from which a label is asked for a light that is probably none of ours
 STILL_SOUGHT = 0.02  # the same of one that was never seen, or whose place is not known
 
 
@@ -220,6 +221,8 @@ class Inquiry:
         for light in undecided:
             labels, odds = posterior.candidates[light]
             kept = candidates.wanted[labels] & self.asked[labels]  # others cannot have lit it
+            if posterior.none[light] >= 0.5:
+                kept &= odds >= RIDES
             lists.append((labels[kept], odds[kept]))
         value = self.pace.cover(lists, len(candidates.weights), len(audit) + len(silent))
         value[audit] = value[silent] = 1.0
