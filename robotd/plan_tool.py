@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,6 +41,13 @@ def add_plan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     plan.add_argument(
         "--flash-seconds", type=float, default=0.5, metavar="S", help="and every label asked there (default: 0.5)"
     )
+    plan.add_argument(
+        "--least",
+        type=float,
+        default=5.0,
+        metavar="PERCENT",
+        help="how much a stop must take off the labels' uncertainty to be worth making (default: 5)",
+    )
     plan.add_argument("-o", "--output", type=Path, metavar="PLAN.json", help="default: stdout")
     plan.add_argument("--png", type=Path, metavar="PNG", help="also draw what each place would teach")
     plan.set_defaults(run=_plan)
@@ -57,15 +65,18 @@ def _plan(arguments: argparse.Namespace) -> int:
     problems.raise_if_any()
     for name in ("stops", "stop_seconds", "flash_seconds"):
         value = getattr(arguments, name)
-        if not value > 0:
+        if not 0 < value < math.inf:
             raise InputError(f"--{name.replace('_', '-')}: found {value:g}; expected above 0")
-    if arguments.target < 0.0:
+    if not 0.0 <= arguments.target < math.inf:
         raise InputError(f"--target: found {arguments.target:g}; expected millimetres, 0 or more")
+    if not 0.0 < arguments.least < 100.0:
+        raise InputError(f"--least: found {arguments.least:g}; expected percent, between 0 and 100")
     settings = PlanSettings(
         most_stops=arguments.stops,
         stop_s=arguments.stop_seconds,
         flash_s=arguments.flash_seconds,
         target_m=1e-3 * arguments.target,
+        least=1e-2 * arguments.least,
     )
     line = load_line(arguments.line) if arguments.line is not None else None
     study = plan(survey, line, free=arguments.free, again=arguments.again, settings=settings)
@@ -105,7 +116,7 @@ def load_line(path: Path) -> Floats:
         if row and not good:
             problems.append(f"{path} line {number}: found {','.join(row)[:40]!r}; expected x,y in metres")
     if not problems and (len(points) < 2 or float(np.ptp(points, axis=0).max()) < 0.05):
-        problems.append(f"{path}: found {len(points)} points; expected two or more along the line")
+        problems.append(f"{path}: found {len(points)} points within 5 cm; expected two or more along the line")
     if problems:
         raise InputError(*problems)
     return np.array(points)

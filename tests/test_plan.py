@@ -279,3 +279,17 @@ def test_the_robot_stops_where_the_plan_says_and_asks_what_it_names(tmp_path):
 def test_a_mission_with_an_unreadable_plan_does_not_start(tmp_path):
     (answer,) = follow_the_plan(tmp_path, "missing.json")
     assert "missing.json: no such file" in json.dumps(answer)
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        (["--target", "nan"], "--target: found nan"),
+        (["--flash-seconds", "inf"], "--flash-seconds: found inf"),
+        (["--least", "0"], "--least: found 0; expected percent"),
+    ],
+)
+def test_numbers_that_no_plan_can_be_made_of_are_refused(option, said, begun, tmp_path, capsys):
+    save_survey(begun, tmp_path / "survey.json")
+    assert main(["plan", str(tmp_path / "survey.json"), *option]) == 2
+    assert said in capsys.readouterr().err

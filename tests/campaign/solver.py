@@ -1,6 +1,6 @@
 """The long run of the solver: how often it finds the right optimum, and whether its uncertainties are true.
 
-    python -m tests.campaign.solver [--seeds 100] [--first 0] [success|starts|efficiency]
+    python -m tests.campaign.solver [--seeds 100] [--first 0] [success|starts|efficiency|coverage]
 
 prints the tables; as a test it fails where a bound is broken. The surveys come from the store layouts, without pixels:
 what detectors would report in the default world (tilted floor, rig and lens off by their priors, slipping wheels), and
@@ -19,13 +19,15 @@ from robotd.solver import solve
 from robotd.solver.bundle import SQUARE, Adjustment
 from robotd.solver.covariance import covariance
 from robotd.solver.problem import STOP, State, build_problem
-from tests.store_surveys import World, load, simulate, true_poses
+from tests.store_surveys import World, load, simulate, true_poses, with_sightings
 
 SEEDS = 100
 STORES = ("room", "warehouse")
 SHARES = (0.0, 0.1, 0.3)
 WORLD = World(reflections=0.0, wrong_ids=0.0)
 COARSE = replace(WORLD, tilt=0.0, rig_rotation=0.0, rig_translation=0.0, lens_px=0.0, centroid_px=1.0, wheel=0.009)
+MISSION = World(centroid_px=0.03)
+UNDECIDED = 0.03  # of the sightings
 THESIS_NOISE = (0.2, 0.2, np.pi / 20)  # m, m, rad of every stop's start
 CHI_SQUARE_95 = 7.8147  # with 3 degrees of freedom
 LEAST_VIEWS, LEAST_STOPS, LEAST_PARALLAX = 3, 2, np.radians(10.0)
@@ -210,6 +212,48 @@ def _information(adjustment, state):
     return V.reshape(3 * points, -1) - W.T @ np.linalg.solve(normal.H, W)
 
 
+def like_a_mission(store, seed):
+    """A survey with all that a simulated mission has: slips, mirrors, wrong and undecided names, sharp centroids."""
+    survey, truth = simulate(store, seed, MISSION)
+    rng = np.random.default_rng([seed, 11])
+    names = sorted(truth)
+
+    def named(stop):
+        for s in stop.sightings:
+            s = replace(s, sigma_px=MISSION.centroid_px)
+            if rng.random() < UNDECIDED:  # the robot could not tell two labels apart
+                yield replace(s, probability=0.5)
+                yield replace(s, label=names[rng.integers(len(names))], probability=0.5)
+            else:
+                yield s
+
+    return with_sightings(survey, named), truth
+
+
+def coverage(name, seeds):
+    """Share of placed labels whose error lies within its own 95 %, and NEES/n, over surveys as missions make them.
+
+    The standard errors are over surveys, because one error of the scale moves all labels of one.
+    """
+    store, rows = load(name), []
+    for seed in seeds:
+        survey, truth = like_a_mission(store, seed)
+        placed = [m for m in solve(survey).labels if m.status == "placed"]
+        error = np.array([np.subtract(m.position, truth[m.label]) for m in placed])
+        square = np.array([e @ np.linalg.solve(np.array(m.covariance), e) for e, m in zip(error, placed, strict=True)])
+        mean = 1e3 * np.linalg.norm(error, axis=1).mean()
+        rows.append([(square < CHI_SQUARE_95).mean(), square.mean() / 3.0, len(placed), mean])
+    mean, sure = np.mean(rows, axis=0), np.std(rows, axis=0) / np.sqrt(len(rows))
+    bound = 10.0 if name == "room" else 20.0
+    print(
+        f"{name:<10}{len(rows)} missions  within 95 %: {100 * mean[0]:.1f} +- {100 * sure[0]:.1f} %  NEES/n "
+        f"{mean[1]:.2f} +- {sure[1]:.2f}  placed {mean[2]:.2f}  mean error {mean[3]:.2f} mm, above {bound:g} mm in "
+        f"{int((np.array(rows)[:, 3] > bound).sum())}",
+        flush=True,
+    )
+    return mean[0]
+
+
 @pytest.mark.parametrize("world", [WORLD, COARSE], ids=["default", "coarse"])
 @pytest.mark.parametrize("name", STORES)
 @pytest.mark.parametrize("share", SHARES)
@@ -232,15 +276,20 @@ def test_uncertainties_are_true(name):
     assert 0.93 <= found.covered <= 0.97
 
 
+@pytest.mark.parametrize("name", STORES)
+def test_uncertainties_of_missions_are_true(name):
+    assert 0.93 <= coverage(name, range(3 * SEEDS)) <= 0.97
+
+
 def main():
     """Print the tables asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tables", nargs="*", help="success, starts or efficiency; default: all")
+    parser.add_argument("tables", nargs="*", help="success, starts, efficiency or coverage; default: all")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--first", type=int, default=0)
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.seeds)
-    tables = arguments.tables or ["success", "starts", "efficiency"]
+    tables = arguments.tables or ["success", "starts", "efficiency", "coverage"]
     if "success" in tables:
         for name in STORES:
             for share in SHARES:
@@ -251,6 +300,9 @@ def main():
     if "efficiency" in tables:
         for name in STORES:
             efficiency(name, range(arguments.first, arguments.first + 6 * arguments.seeds))
+    if "coverage" in tables:
+        for name in STORES:
+            coverage(name, seeds)
 
 
 if __name__ == "__main__":
