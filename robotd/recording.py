@@ -20,11 +20,12 @@ ends in the middle, because the machine lost power, can be read up to the last f
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -38,6 +39,8 @@ from .records import Frame
 
 if TYPE_CHECKING:
     from mcap.records import Message  # loaded by those who record: it takes a Pi a tenth of a second, and 3 MB
+
+log = logging.getLogger("robotd.recording")
 
 FRAME = struct.Struct("<dIHH")
 FRAME_SCHEMA = "robotd.Frame/1"
@@ -361,7 +364,10 @@ def read_serial(path: Path, port: str | None = None) -> Iterator[SerialBytes]:
 
 
 class _Messages:
-    """Origin and message of every record, up to the end of the file or to where it was cut off."""
+    """Origin and message of every record, up to the end of the file or to where it was cut off.
+
+    A damaged piece (a chunk whose checksum is wrong: a quarter of a second at most) is left out, and told.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -369,7 +375,6 @@ class _Messages:
         self.is_whole = False  # known at the end
 
     def __iter__(self) -> Iterator[tuple[Source, Message]]:
-        from mcap.records import Channel, Message, Metadata, Schema
         from mcap.stream_reader import StreamReader
 
         schemas: dict[int, str] = {}
@@ -379,29 +384,75 @@ class _Messages:
         except OSError as error:
             raise InputError(f"{self._path}: cannot be read: {error.strerror or error}") from error
         with file:
-            records = StreamReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT).records
-            is_begun = False
+            records = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_LIMIT).records
+            is_begun, damaged = False, 0
             while True:
                 try:
                     record = next(records, None)
                 except Exception as error:  # the decompressor, the reader and struct each have their own
                     if not is_begun:
-                        raise InputError(f"{self._path}: not a recording (MCAP): {error or 'empty'}") from error
-                    return
+                        why = str(error) or "it is empty, or ends in its first bytes"
+                        raise InputError(f"{self._path}: not a recording (MCAP): {why}") from error
+                    break
                 if record is None:
                     self.is_whole = True
-                    return
+                    break
                 is_begun = True
-                if isinstance(record, Schema):
-                    schemas[record.id] = record.name
-                elif isinstance(record, Channel):
-                    sources[record.id] = Source(record.topic, schemas.get(record.schema_id, ""), dict(record.metadata))
-                elif isinstance(record, Metadata) and record.name == ABOUT:
-                    self.about = dict(record.metadata)
-                elif isinstance(record, Message):
-                    if record.channel_id not in sources:
-                        return  # damaged
+                parts = _inside(record)
+                damaged += parts is None
+                yield from self._messages(parts or (), schemas, sources)
+        if damaged:
+            log.warning("%s: %d damaged pieces are left out", self._path, damaged)
+
+    def _messages(
+        self, records: Iterable[Any], schemas: dict[int, str], sources: dict[int, Source]
+    ) -> Iterator[tuple[Source, Message]]:
+        """Those among some records; of the others the meaning is kept."""
+        from mcap.records import Channel, Message, Metadata, Schema
+
+        for record in records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, Channel):
+                sources[record.id] = Source(record.topic, schemas.get(record.schema_id, ""), dict(record.metadata))
+            elif isinstance(record, Metadata) and record.name == ABOUT:
+                self.about = dict(record.metadata)
+            elif isinstance(record, Message):
+                if record.channel_id not in sources:  # they were described in a piece that is damaged
+                    for number, source in _described(self._path).items():
+                        sources.setdefault(number, source)
+                if record.channel_id in sources:
                     yield sources[record.channel_id], record
+
+
+def _inside(record: Any) -> list[Any] | None:
+    """The records of a chunk, or a record itself; None if it is damaged."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import breakup_chunk
+
+    if not isinstance(record, Chunk):
+        return [record]
+    try:
+        return list(breakup_chunk(record, validate_crc=True))
+    except Exception:  # the decompressor, the reader and struct each have their own
+        return None
+
+
+def _described(path: Path) -> dict[int, Source]:
+    """Where messages are from, by what the end of a recording repeats; empty if it is damaged, too."""
+    from mcap.reader import make_reader
+
+    try:
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+    except Exception:  # as above
+        return {}
+    if summary is None:
+        return {}
+    return {
+        number: Source(channel.topic, summary.schemas[channel.schema_id].name, dict(channel.metadata))
+        for number, channel in summary.channels.items()
+    }
 
 
 def _nanoseconds(t: float) -> int:

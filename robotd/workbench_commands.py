@@ -363,7 +363,8 @@ def tune(arguments: argparse.Namespace) -> int:
     else:
         _say(arguments, "how good they are elsewhere is not known; give other footage with --report")
     if arguments.output is not None:
-        write_atomic(arguments.output, "".join(f"{k} = {toml(v)}\n" for k, v in best.settings.items()).encode())
+        lines = [f"{k} = {toml(v)}" for k, v in best.settings.items()] or ["# no setting is better than those given"]
+        write_atomic(arguments.output, ("\n".join(lines) + "\n").encode())
     return _done(arguments, result)
 
 

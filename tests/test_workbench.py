@@ -100,6 +100,12 @@ def test_marks_come_back_as_they_were_saved(tmp_path_factory, marks):
     assert load_tags(path, "front") == [tag for tag in marks if tag.camera in (None, "front")]
 
 
+def test_a_mark_outside_of_the_images_is_named_and_not_counted_as_missed(tmp_path, capsys):
+    path = write(tmp_path / "one.mcap", film())
+    save_tags([Tag(99999.0, 3.0)], tags_path(path))
+    assert "one.mcap.tags.toml: mark at 99999,3 is outside of the image" in refused(capsys, "score", path)
+
+
 def test_every_mistake_in_a_file_of_marks_is_named(tmp_path):
     path = tmp_path / "x.tags.toml"
     path.write_text(

@@ -15,7 +15,7 @@ from ..recording import Contents, read_contents
 from ..records import Flash
 from .detectors import Detector, recorded_settings
 from .score import Score
-from .tags import Tag, load_tags, moved, tags_path
+from .tags import Tag, is_inside, load_tags, moved, tags_path
 
 WHOLE = 0.8  # a mark that holds for so much of a clip counts in it; one that holds for less is not judged there
 SHORT = 0.75  # of a clip: a shorter rest of the footage is left out
@@ -44,12 +44,17 @@ class Tagged:
         return path if self.camera is None else f"{path}:{self.camera}"
 
     def frames(self, since: float = 0.0, until: float = math.inf) -> Generator[tuple[int, Shot]]:
-        """Number and image of every frame in a span of time; raises InputError at a damaged one."""
+        """Number and image of every frame in a span of time.
+
+        Raises InputError at a damaged one, and if a mark lies outside of the images.
+        """
         shots = self.footage.play()
         begin: float | None = None
         try:
             for number, shot in enumerate(shots):
-                begin = shot.t if begin is None else begin
+                if begin is None:
+                    begin = shot.t
+                    self._check((shot.image.shape[1], shot.image.shape[0]))
                 t = shot.t - begin
                 if t > until:
                     return
@@ -57,6 +62,16 @@ class Tagged:
                     yield number, replace(shot, t=t)
         finally:
             shots.close()
+
+    def _check(self, size: tuple[int, int]) -> None:
+        file, image = tags_path(self.footage.path), f"{size[0]}x{size[1]}"
+        problems = [
+            f"{file}: mark at {tag.u:g},{tag.v:g} is outside of the image of {image}; correct or remove it"
+            for tag in self.tags
+            if not is_inside(tag, size)
+        ]
+        if problems:
+            raise InputError(*problems)
 
 
 def open_tagged(

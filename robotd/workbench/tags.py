@@ -90,11 +90,15 @@ def save_tags(tags: Sequence[Tag], path: Path) -> None:
     write_atomic(path, ("\n".join(lines) + "\n").encode())
 
 
+def is_inside(tag: Tag, size: tuple[int, int]) -> bool:
+    """Whether it lies in images of `size`."""
+    return -0.5 <= tag.u < size[0] - 0.5 and -0.5 <= tag.v < size[1] - 0.5
+
+
 def add_tag(tags: Sequence[Tag], new: Tag, size: tuple[int, int]) -> list[Tag]:
     """The marks and a new one; raises InputError if it lies outside of images of `size` or on another of its camera."""
-    width, height = size
-    if not (-0.5 <= new.u < width - 0.5 and -0.5 <= new.v < height - 0.5):
-        raise InputError(f"{new.u:g},{new.v:g} is outside of the image of {width}x{height}")
+    if not is_inside(new, size):
+        raise InputError(f"{new.u:g},{new.v:g} is outside of the image of {size[0]}x{size[1]}")
     for number, tag in enumerate(tags, 1):
         if tag.camera == new.camera and tag.kind == new.kind and math.hypot(tag.u - new.u, tag.v - new.v) < 1.0:
             raise InputError(f"{new.u:g},{new.v:g} is mark {number} already ({tag.u:g},{tag.v:g}); remove that first")
