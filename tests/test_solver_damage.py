@@ -90,3 +90,10 @@ def test_every_command_answers_damage_with_words(tmp_path, capsys):
         for command in ("solve", "check"):
             assert main([command, str(tmp_path / "survey.json")]) == 2
             assert str(tmp_path / "survey.json") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["odometry_scale", "odometry_turn", "tilt_rad", "focal_px", "camera_translation_m"])
+def test_a_prior_too_small_for_numbers_counts_as_exact(name):
+    survey, _ = noisy_room()
+    tiny, exact = (solve(replace(survey, priors=replace(survey.priors, **{name: sigma}))) for sigma in (1e-300, 0.0))
+    assert [label.position for label in tiny.labels] == [label.position for label in exact.labels]

@@ -101,6 +101,8 @@ def frame_covariance(adjustment: Adjustment, state: State) -> Floats | None:
         return None
     normal = adjustment.normal(adjustment.linearise(state, SQUARE), state, SQUARE)
     S, *_ = adjustment.eliminate(normal)
+    if not np.isfinite(S).all():  # of measurements stated more exactly than numbers can hold
+        return None
     try:
         inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S)))
     except np.linalg.LinAlgError:

@@ -204,8 +204,8 @@ def _chance(optimum: Optimum) -> float:
     spread = np.eye(len(entries)) - left[np.ix_(entries, entries)] / np.outer(prior, prior)
     values, vectors = np.linalg.eigh(spread)
     told = values > _TOLD
-    size = (vectors.T @ (optimum.state.frame[entries] / prior))[told] ** 2 / values[told]
-    return float(gammaincc(0.5 * len(size), 0.5 * size.sum())) if len(size) else 1.0
+    size = float(((vectors.T @ (optimum.state.frame[entries] / prior))[told] ** 2 / values[told]).sum())
+    return float(gammaincc(0.5 * np.count_nonzero(told), 0.5 * size)) if told.any() and np.isfinite(size) else 1.0
 
 
 def is_below_floor(z: float, variance: float) -> bool:

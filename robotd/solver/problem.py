@@ -26,7 +26,7 @@ from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
 from ..records import CameraModel, Floats, Matrix3, Survey
 from ..survey_checks import Problems, check_roof, check_units
-from .wheel_errors import arc_by_errors, coupling, move_by_errors
+from .wheel_errors import EXACT, arc_by_errors, coupling, move_by_errors, odometry_sigmas
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -496,6 +496,5 @@ def _prior_sigma(survey: Survey, roofs: Roofs, axes: Floats, fixed_first: bool) 
     seen = np.isin(np.arange(len(survey.rig.beacons)), roofs.which)
     plane = np.where(watches[:, None] & axes.any(axis=(2, 3)), 1.0, 0.0)
     beacons = np.repeat(np.where(seen, p.beacon_m, 0.0), BEACON)
-    alone = 1.0 - p.odometry_correlation**2 if p.odometry_scale > 0.0 else 1.0
-    odometry = p.odometry_scale, p.odometry_turn * np.sqrt(max(alone, 1e-6)), p.odometry_drift
-    return np.concatenate([stops.ravel(), cameras, plane.ravel(), beacons, odometry])
+    sigma = np.concatenate([stops.ravel(), cameras, plane.ravel(), beacons, odometry_sigmas(p)])
+    return np.where(sigma < EXACT, 0.0, sigma)

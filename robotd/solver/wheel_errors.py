@@ -6,6 +6,7 @@ import numpy as np
 
 from ..records import Floats, Move, Priors
 
+EXACT = 1e-12  # of a prior: so little that its information would drown all other in rounding
 SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # of a slipped move, where it ended: one wheel spun for some centimetres
 _SAME_MOVE_M = 1e-3
 
@@ -47,7 +48,13 @@ def slip_covariance(moves: Floats) -> Floats:
     return result
 
 
+def odometry_sigmas(priors: Priors) -> tuple[float, float, float]:
+    """Prior standard deviations of scale, of turns beyond `coupling` times the scale's error, and of drift."""
+    alone = 1.0 - priors.odometry_correlation**2 if priors.odometry_scale > EXACT else 1.0
+    return priors.odometry_scale, priors.odometry_turn * float(np.sqrt(max(alone, 1e-6))), priors.odometry_drift
+
+
 def coupling(priors: Priors) -> float:
     """Error of turns to expect per error of scale: turns show well in a survey and tell about its scale."""
     p = priors
-    return p.odometry_correlation * p.odometry_turn / p.odometry_scale if p.odometry_scale > 0.0 else 0.0
+    return p.odometry_correlation * p.odometry_turn / p.odometry_scale if p.odometry_scale > EXACT else 0.0
