@@ -53,6 +53,13 @@ def test_a_first_stop_learns_how_many_commands_a_second_the_system_sends(rate):
     assert outcome.right >= 26
 
 
+def test_a_system_that_is_five_times_slower_than_configured_names_lights_too():
+    outcomes = coded_stops(60, 20, EIGHT, range(4), commands_per_s=2.0)
+    assert sum(outcome.wrong for outcome in outcomes) == 0
+    assert sum(outcome.right for outcome in outcomes) >= 70
+    assert all(0.4 < outcome.inquiry.delays.interval < 0.6 for outcome in outcomes)
+
+
 def test_no_wrong_throughput_is_believed_that_a_dozen_lights_fit_by_accident():
     for outcome in coded_stops(1000, 60, ONE, [21]):
         assert outcome.right >= 35
@@ -89,7 +96,7 @@ def test_the_kernel_of_the_throughput_gives_what_numpy_does():
 
 
 def test_few_lights_leave_the_part_of_the_grid_that_all_lights_choose():
-    outcome = coded_stops(400, 40, ONE, [2], commands_per_s=14.0)[0]
+    outcome = coded_stops(400, 40, ONE, [3], commands_per_s=14.0)[0]
     evidence, prior = outcome.inquiry.evidence, Prior(outcome.inquiry.candidates.weights)
     whole = []
     for part in (throughput.PART, 1):

@@ -26,7 +26,7 @@ STRAY = 0.03  # fraction of commands that are overtaken, or delayed in another w
 STAMP_S = 0.15  # frame stamps and the time of a request may disagree by so much
 PRIOR_DELAYS = 20.0  # how many measured delays the configured ones are worth
 TABLE_STEP_S = 0.02
-INTERVAL_SPREAD = 0.35  # of the configured throughput's logarithm: it may be half or twice as much
+INTERVAL_SPREAD = 0.6  # of the configured throughput's logarithm: it may be a fifth or five times as much
 KNOWN_SPREAD, RATE_DRIFT = 0.05, 0.01  # spread from which on it counts as known; what remains
 Numbers = NDArray[np.intp]
 

@@ -28,7 +28,7 @@ Flags = NDArray[np.bool_]
 
 TRIES, MORE_TRIES = 9, 20  # slots after which a light is left undecided, with many durations and with few
 FIRST_LIGHTS = 60.0  # labels that a stop shows of which nothing is known
-SLOWEST = 2.0  # times longer than supposed a queue may be while the throughput is not known,
+SLOWEST = 6.0  # times longer than supposed a queue may be while the throughput is not known,
 SILENCE = 4.0  # and no longer than until so many usual pauses between two flashes have passed without one
 HURRY = 0.5  # of the time until their turn after which commands are handed over, while the throughput is not known
 RECKONED = 0.96  # of a stop's time is reckoned with at first: the rest is for what goes wrong
