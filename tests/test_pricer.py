@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
 import subprocess
 import sys
@@ -166,6 +167,39 @@ def test_the_driver_gives_up_on_a_gateway_that_hangs(tmp_path):
             await driver.close()
 
     asyncio.run(run())
+
+
+def test_a_kept_connection_that_a_firewall_forgot_is_made_anew_under_the_same_key(tmp_path):
+    (tmp_path / "token").write_text(TOKEN)
+    (tmp_path / "token").chmod(0o600)
+    keys, served = [], []
+
+    async def serve(reader, writer):
+        forgotten = not keys
+        served.append((asyncio.current_task(), writer))
+        while line := await reader.readline():
+            request = json.loads(line)
+            if "key" in request:
+                keys.append(request["key"])
+                if forgotten:
+                    continue  # nothing comes back
+            writer.write(json.dumps({"id": request["id"], "ok": True, "refused": {}}).encode() + b"\n")
+        writer.close()
+
+    async def run():
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        driver = make_driver(tmp_path, server.sockets[0].getsockname()[1], timeout_s=0.2)
+        await driver.open()
+        assert await driver.flash(["A1"], 1.0, [3]) == {}
+        await driver.close()
+        server.close()
+        for task, writer in served:
+            await task
+            await writer.wait_closed()
+
+    asyncio.run(run())
+    assert len(keys) == 2
+    assert len(set(keys)) == 1
 
 
 class Anything:
