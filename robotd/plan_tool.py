@@ -44,9 +44,9 @@ def add_plan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     plan.add_argument(
         "--least",
         type=float,
-        default=5.0,
+        default=1.0,
         metavar="PERCENT",
-        help="how much a stop must take off the labels' uncertainty to be worth making (default: 5)",
+        help="how much a stop must take off the labels' uncertainty to be worth making (default: 1)",
     )
     plan.add_argument("-o", "--output", type=Path, metavar="PLAN.json", help="default: stdout")
     plan.add_argument("--png", type=Path, metavar="PNG", help="also draw what each place would teach")

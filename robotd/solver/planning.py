@@ -52,7 +52,7 @@ class PlanSettings:
     stop_s: float = 15.0
     flash_s: float = 0.5
     target_m: float = 0.0
-    least: float = 0.05
+    least: float = 0.01
     spare: float = 0.005
 
 
