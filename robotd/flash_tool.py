@@ -10,21 +10,19 @@ from typing import Any
 
 import numpy as np
 
+from .collected import read_collected
 from .config import Calibration, load_calibration
-from .errors import InputError
-from .files import read_bytes
 from .flash_recording import learn_recorded
 from .recording import read_contents, read_frames
 from .records import Floats
 from .solver.flash_picture import FlashCurve, draw_flash
 
-FORMAT = "robotd-calibration-data/1"
 _NEAR, _AROUND = 2, 6  # px: half sides of the spot that is summed and of what is its background
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; returns the exit code. Raises InputError if the recording is none, or shows no pattern."""
-    data, recording = _data(arguments)
+    data, recording = read_collected(arguments, "flash", _checked)
     camera = str(data["camera"])
     before = Calibration()
     if arguments.calibration is not None:
@@ -63,22 +61,9 @@ def _summary(learnt: Any) -> dict[str, Any]:
     }
 
 
-def _data(arguments: argparse.Namespace) -> tuple[dict[str, Any], Path]:
-    where = arguments.folder / "data.json"
-    try:
-        data = json.loads(read_bytes(where))
-        found = f"{data['format']} of {data['what']}"
-        if found != f"{FORMAT} of flash":
-            raise InputError(f"{where}: is {found}; expected {FORMAT} of flash")
-        named = Path(str(data["recording"]["file"]))
-        float(data["asked_t"]), float(data["asked_s"]), data["camera"], data["label"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{where}: is not what robotctl calibrate flash writes: {error!r}") from error
-    places = [arguments.recording] if arguments.recording is not None else [named, arguments.folder / named.name]
-    for place in places:
-        if place.is_file():
-            return data, place
-    raise InputError(f"{places[-1]}: there is no such recording; copy it from the robot ({named}), or give --recording")
+def _checked(data: dict[str, Any]) -> dict[str, Any]:
+    float(data["asked_t"]), float(data["asked_s"]), data["camera"], data["label"]
+    return data
 
 
 def _light(

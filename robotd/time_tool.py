@@ -5,20 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .collected import read_collected
 from .config import Calibration, load_calibration, save_stamp_offsets
-from .errors import InputError, SolverError
-from .files import read_bytes
+from .errors import SolverError
 from .recording import read_contents, read_frames
 from .records import Floats
 from .solver.calibrate_time import Lateness, lateness, view_turns
 from .solver.time_picture import draw_lateness
-
-FORMAT = "robotd-calibration-data/1"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -34,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     before = Calibration()
     if arguments.calibration is not None and arguments.calibration.exists():
         before = load_calibration(arguments.calibration)
-    t, heading, recording = _data(arguments)
+    (t, heading), recording = read_collected(arguments, "time", _turning)
     contents = read_contents(recording)
     found: dict[str, tuple[Lateness, float]] = {}
     doubts = []
@@ -76,24 +73,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _data(arguments: argparse.Namespace) -> tuple[Floats, Floats, Path]:
-    where = arguments.folder / "data.json"
-    try:
-        data = json.loads(read_bytes(where))
-        found = f"{data['format']} of {data['what']}"
-        if found != f"{FORMAT} of time":
-            raise InputError(f"{where}: is {found}; expected {FORMAT} of time")
-        columns = data["odometry"]["columns"]
-        rows = np.array(data["odometry"]["rows"], dtype=np.float64).reshape(-1, len(columns))
-        t, heading = (rows[:, columns.index(name)] for name in ("t", "heading"))
-        named = Path(str(data["recording"]["file"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{where}: is not what robotctl calibrate time writes: {error!r}") from error
-    places = [arguments.recording] if arguments.recording is not None else [named, arguments.folder / named.name]
-    for place in places:
-        if place.is_file():
-            return t, heading, place
-    raise InputError(f"{places[-1]}: there is no such recording; copy it from the robot ({named}), or give --recording")
+def _turning(data: dict[str, Any]) -> tuple[Floats, Floats]:
+    """Stamps (F,) in seconds and headings (F,) in radians."""
+    columns = data["odometry"]["columns"]
+    rows = np.array(data["odometry"]["rows"], dtype=np.float64).reshape(-1, len(columns))
+    t, heading = (rows[:, columns.index(name)] for name in ("t", "heading"))
+    return t, heading
 
 
 def _summary(late: Lateness, offset: float) -> dict[str, Any]:

@@ -38,7 +38,7 @@ LAYERS = {
     ],
     2: [
         *("clock", "link", "real", "config", "files", "bus", "hardware", "journal", "upload", "telemetry", "recording"),
-        *("recording_upload", "flash_recording", "sender", "label_list"),
+        *("recording_upload", "collected", "flash_recording", "sender", "label_list"),
         *("journal_file", "journal_records", "secret_file", "web"),
         *("serial_log", "roomba", "ticker", "guardian", "notify", "serial_port"),
         *("camera_feed", "prompt", "footage", "v4l2", "v4l2_api", "v4l2_controls"),
