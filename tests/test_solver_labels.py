@@ -16,6 +16,7 @@ from robotd.records import (
 )
 from robotd.solver import solve
 from tests.store_surveys import (
+    QUIET,
     World,
     label_of,
     load,
@@ -46,13 +47,19 @@ def test_nearly_parallel_views_are_not_enough():
     assert label.reason.startswith("views nearly parallel")
 
 
-def reflected(survey, truth, name, stops, probability=None, raised=0.0):
+def reflected(survey, truth, name, stops, probability=None, raised=0.0, behind=0.5):
     """Rival sightings of one label: its image in a mirror behind it, from the given stops; `raised` by a tilted one."""
     x, y, z = truth[name]
-    image = np.array([[x, 2.0 * (y - 0.5) - y, z + raised]])
+    survey = with_sightings(survey, lambda stop: [s for s in stop.sightings if s.label != name or stop.stop in stops])
+    return shown_at(survey, name, (x, y - 2.0 * behind, z + raised), stops, probability)
+
+
+def shown_at(survey, name, position, stops, probability=None):
+    """Sightings of a label as if it were elsewhere, beside its own, one from each of some stops."""
+    image = np.array([position])
 
     def change(stop):
-        sightings = [s for s in stop.sightings if s.label != name or stop.stop in stops]
+        sightings = list(stop.sightings)
         if stop.stop not in stops:
             return sightings
         T = pose_matrix(stop.odometry.x, stop.odometry.y, stop.odometry.heading)
@@ -85,10 +92,11 @@ def test_the_probability_of_sightings_breaks_a_tie():
     np.testing.assert_allclose(label.position, truth["S04"], atol=1e-4)
 
 
+@pytest.mark.parametrize("behind", [0.02, 0.5])
 @pytest.mark.parametrize("direct", [2, 3])
-def test_of_a_label_and_its_image_in_upright_glass_the_nearer_one_is_the_label(direct):
+def test_of_a_label_and_its_image_in_upright_glass_the_nearer_one_is_the_label(direct, behind):
     survey, truth = quiet_room()
-    both = reflected(survey, truth, "S04", [s.stop for s in survey.stops])
+    both = reflected(survey, truth, "S04", [s.stop for s in survey.stops], behind=behind)
     seen = [s.stop for s in survey.stops if sum(g.label == "S04" for g in s.sightings) == 1]
     assert len(seen) > direct
 
@@ -131,6 +139,25 @@ def test_two_agreeing_sightings_among_as_many_others_are_not_trusted():
     label = label_of(solve(with_sightings(survey, spoil)), "N17")
     assert label.status == "unplaced"
     assert "sightings agree, which may be chance" in label.reason
+
+
+def test_a_label_at_camera_height_of_which_any_two_sightings_meet_is_not_placed_by_two_against_one():
+    store = load("room")
+    level = next(label for label in store["labels"] if label["id"] == "N17")
+    level["position"][2] = 0.5
+    survey, truth = simulate(store, 1, QUIET)
+    first, second, third = [s.stop for s in survey.stops if any(g.label == "N17" for g in s.sightings)][:3]
+    stop = survey.stops[first - 1].odometry
+    eye = np.array([stop.x, stop.y, 0.5])
+    wrong = eye + 0.6 * (np.array(truth["N17"]) - eye)  # in line with it, from the first stop
+    two = with_sightings(survey, lambda s: [g for g in s.sightings if g.label != "N17" or s.stop in (first, second)])
+    doubtful = shown_at(two, "N17", wrong, [third])
+    label = label_of(solve(doubtful), "N17")
+    assert label.sightings == 3
+    assert (label.status, label.position) == ("ambiguous", None)
+    near = [np.linalg.norm(np.subtract(c.position, truth["N17"])) for c in label.candidates]
+    assert min(near) < 0.01
+    assert label_of(solve(two), "N17").status == "placed"
 
 
 def test_every_sighting_is_accounted_for():

@@ -19,9 +19,9 @@ from ..records import Floats, Map, Pose, Stop, Survey, Vector3
 from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment, Loss
 from .mapping import to_map
-from .placement import Placement, retriangulate
+from .placement import Placement, ray_tolerance, retriangulate
 from .problem import STOP, Bools, Ints, Motions, Moves, Problem, Roofs, Sightings, State, build_problem
-from .robust import Optimum, optimise, ray_tolerance
+from .robust import Optimum, optimise
 from .weights import OUTLIER
 
 Arrays = TypeVar("Arrays", Moves, Motions, Roofs)

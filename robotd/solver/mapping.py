@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -37,7 +38,6 @@ from .ties import Rival, side_of
 from .weights import OUTLIER
 
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
-_TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
 _TRUSTED_STOPS = 4  # agreement from as many is no chance, however many other sightings disagree
 _OUTSIDE_M = 0.5  # a position so far outside all others may be an image in a shop window or a glossy shelf
 _SAME_PLACE_M = 0.05
@@ -213,9 +213,8 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
         return unplaced("seen from one stop only; map it from a second stop")
     if tally.stops[i] < 2:
         return unplaced("seen only from stops that could not be joined to the map; map it together with mapped labels")
-    lead = optimum.gain[i] - optimum.rival_gain[i]
-    if np.isfinite(optimum.rival_points[i, 0]) and lead < _TIE and optimum.rival_gain[i] > _TIE * optimum.gain[i]:
-        return _ambiguous(optimum, i, label, count, inliers, optimum.rival_points[i])
+    if tied := optimum.hypotheses.tied(i):
+        return _ambiguous(optimum, i, label, count, inliers, tied)
     if covariance is None:
         return unplaced(
             f"its {count} sightings do not meet in one point (reflections or wrong identities); flash it again, alone"
@@ -243,10 +242,10 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
         return MappedLabel(label, "ambiguous", None, None, count, inliers, reason, candidates)
     if tally.image[i]:
         reason = "perhaps an image in glass: one sighting puts the label nearer; map it from another stop"
-        return _ambiguous(optimum, i, label, count, inliers, tally.in_front[i], reason)
+        return _ambiguous(optimum, i, label, count, inliers, [tally.in_front[i]], reason)
     if i in tally.in_glass:
         reason, other = tally.in_glass[i]
-        return _ambiguous(optimum, i, label, count, inliers, other, reason)
+        return _ambiguous(optimum, i, label, count, inliers, [] if other is None else [other], reason)
     return MappedLabel(label, "placed", position, covariance, count, inliers)
 
 
@@ -328,12 +327,12 @@ def _in_glass(optimum: Optimum) -> dict[int, tuple[str, Floats | None]]:
 
 
 def _ambiguous(
-    optimum: Optimum, i: int, label: str, count: int, inliers: int, other: Floats | None, reason: str | None = None
+    optimum: Optimum, i: int, label: str, count: int, inliers: int, others: list[Floats], reason: str | None = None
 ) -> MappedLabel:
     problem, state = optimum.problem, optimum.state
     mine = Adjustment(problem, problem.sightings.select(problem.sightings.label == i))
     candidates = []
-    for point in (state.points[i],) if other is None else (state.points[i], other):
+    for point in (state.points[i], *others):
         points = state.points.copy()
         points[i] = point
         linear = mine.residuals(replace(state, points=points), SQUARE)
@@ -341,12 +340,13 @@ def _ambiguous(
         cost = 0.5 * np.minimum((linear.residual**2).sum(axis=1), OUTLIER).sum()
         candidates.append(Candidate(_vector(point), float(cost)))
     candidates.sort(key=lambda c: c.cost)
-    distance = float(np.linalg.norm(np.subtract(candidates[0].position, candidates[-1].position)))
+    distance = max(math.dist(a.position, b.position) for a in candidates for b in candidates)
     theirs = [name for name in (_label_at(optimum, i, c.position) for c in candidates) if name is not None]
     if theirs and reason is None:
         reason = f"conflicting identities: some of its sightings are those of {theirs[0]}; flash both again, alone"
+    several = "two" if len(candidates) == 2 else str(len(candidates))
     reason = reason or (
-        f"two positions {distance:.1f} m apart explain its sightings equally well (mirror solutions tied); "
+        f"{several} positions {distance:.1f} m apart explain its sightings equally well (mirror solutions tied); "
         "map it from another stop"
     )
     return MappedLabel(label, "ambiguous", None, None, count, inliers, reason, tuple(candidates))

@@ -89,6 +89,14 @@ def _assemble(
     return retriangulate(problem, state, tolerance, np.isin(segment, list(axes)))
 
 
+def ray_tolerance(problem: Problem) -> float:
+    """Four standard deviations of a sighting as an angle, and never less than what tilt and calibration leave."""
+    if len(problem.sightings) == 0:
+        return 0.015
+    focal = min(float(camera.focal.min()) for camera in problem.cameras)
+    return max(0.015, 4.0 * float(np.median(problem.sightings.sigma)) / focal)
+
+
 def retriangulate(
     problem: Problem, state: State, tolerance: float, placed: Bools, labels: Ints | None = None
 ) -> tuple[State, Bools]:

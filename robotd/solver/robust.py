@@ -16,10 +16,11 @@ from ..geometry.transforms import se2_relative
 from ..records import Floats
 from .bundle import SQUARE, Adjustment, Loss, Solution
 from .covariance import Covariance, covariance
-from .initial import epipolar_moves, triangulate, world_rays
+from .hypotheses import Hypotheses, behind_glass, hypotheses, in_floor, out_of_glass, support, with_shared
+from .initial import epipolar_moves
 from .known_labels import contradicted, difference, slipped
-from .placement import Placement, at_first_stop, detach, place, retriangulate
-from .problem import Bools, Ints, Known, Problem, State, anchors, stops_per_label
+from .placement import Placement, at_first_stop, detach, place, ray_tolerance, retriangulate
+from .problem import Bools, Ints, Problem, State, anchors, stops_per_label
 from .tie_sightings import without_ties
 from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
@@ -33,10 +34,6 @@ _ENOUGH = 20  # sightings at a stop, to begin with
 _FEW_DOUBTS = 0.001  # share of sightings not explained, below which labels are not triangulated once more
 _CLEAN = 0.97  # share of sightings explained at which no other start can do better
 _SAME = 0.5  # difference of two starts' costs below which they found the same minimum
-_FLOOR_IMAGE_PX = 6.0
-_UPRIGHT_M = 0.03  # a label and its image in upright glass are equally high; what tilt and calibration leave
-_IMAGES = 4  # images of one label in different panes that are looked for
-_CHANCE = 0.25  # share of an image's support with which the label itself stands out from chance
 _MEDIAN = 2.0 * np.log(2.0)  # of the squared length of a standard normal vector in the plane
 
 
@@ -67,9 +64,9 @@ class Optimum:
 
     `problem` has slipped moves, wrong known labels and unplaced stops taken out. `inlier` (N,) says which of its
     sightings take part; `adjustment` is their least-squares problem and `state` its optimum. `placed` (S,) are the
-    stops that have a place in the world. `reflected` (N,) are sightings of a label's image in floor or glass. `gain`
-    (L,) is each label's support, `rival_points` (L, 3) the second best position (NaN where there is none) and
-    `rival_gain` (L,) its support. `rival` is another optimum of the whole survey that explains it about as well.
+    stops that have a place in the world. `reflected` (N,) are sightings of a label's image in floor or glass.
+    `hypotheses` says where else each label may be. `rival` is another optimum of the whole survey
+    that explains it about as well.
     """
 
     problem: Problem
@@ -79,9 +76,7 @@ class Optimum:
     adjustment: Adjustment
     covariance: Covariance
     reflected: Bools
-    gain: Floats
-    rival_points: Floats
-    rival_gain: Floats
+    hypotheses: Hypotheses
     rival: Rival | None
     iterations: int
     converged: bool
@@ -188,14 +183,6 @@ def _thinned(problem: Problem) -> Problem:
     return replace(problem, sightings=problem.sightings.select(problem.sightings.label % stride == 0))
 
 
-def ray_tolerance(problem: Problem) -> float:
-    """Four standard deviations of a sighting as an angle, and never less than what tilt and calibration leave."""
-    if len(problem.sightings) == 0:
-        return 0.015
-    focal = min(float(camera.focal.min()) for camera in problem.cameras)
-    return max(0.015, 4.0 * float(np.median(problem.sightings.sigma)) / focal)
-
-
 def _weights(adjustment: Adjustment, state: State) -> Floats:
     """(N,) how far the state explains each sighting, 0 to 1."""
     return _REFERENCE((adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1))[1]
@@ -211,15 +198,13 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
     tolerance = max(1e-2, 1e-5 * len(problem.sightings))
     solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=tolerance, damping=1e-6)
     iterations, state = iterations + solution.iterations, solution.state
-    state, rival = doubted(problem, state, problem.sightings.select(_support(everything, state)[1]))
-    state, reflected, hypotheses = _out_of_glass(everything, state)
+    state, rival = doubted(problem, state, problem.sightings.select(support(everything, state)[1]))
+    state, reflected, found = out_of_glass(everything, state)
     if reflected.any():
-        hypotheses = _hypotheses(everything, state)
-    gain, rival_points, rival_gain = hypotheses
-    better = rival_gain > gain
-    better &= ~(_level(problem, state, rival_points) & _farther(problem, state, rival_points))
+        found = hypotheses(everything, state)
+    better = (found.rival_gain > found.gain) & ~behind_glass(problem, state, found.rivals)
     if better.any():
-        state = replace(state, points=np.where(better[:, None], rival_points, state.points))
+        state = replace(state, points=np.where(better[:, None], found.rivals, state.points))
         problem = _without_known(problem, state, np.flatnonzero(better[problem.known.label]))
     for attempt in range(2):
         everything, state, inlier, adjustment, spent, converged = _least_squares(everything, state)
@@ -234,10 +219,11 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         everything = Adjustment(problem, problem.sightings)
     adjustment, state, sure = weighed(adjustment, state, sure, problem.columns.sigma[problem.sightings.source[inlier]])
     kept = state
-    state, reflected, (gain, rival_points, rival_gain) = _out_of_glass(everything, state)
+    state, reflected, found = out_of_glass(everything, state)
     if state is not kept:  # a label that only now seems to be its image stays where it was adjusted
         state = kept
-        gain, rival_points, rival_gain = _hypotheses(everything, state, reflected)
+        found = hypotheses(everything, state, reflected)
+    found = with_shared(everything, state, found, reflected)
     factor = float(np.median(problem.sightings.sigma / stated)) if len(stated) else 1.0
     if factor > 1.0:
         note = f"sightings scatter {factor:.1f} times as much as their sigma_px says; uncertainties were scaled"
@@ -249,10 +235,8 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         inlier,
         adjustment,
         sure,
-        (_in_floor(everything, state) | reflected) & ~inlier,
-        gain,
-        rival_points,
-        rival_gain,
+        (in_floor(everything, state) | reflected) & ~inlier,
+        found,
         rival,
         iterations,
         converged,
@@ -382,113 +366,3 @@ def _excess(adjustment: Adjustment, state: State, sure: Covariance) -> float:
 
 def _rescaled(problem: Problem, factor: float) -> Problem:
     return replace(problem, sightings=replace(problem.sightings, sigma=problem.sightings.sigma * factor))
-
-
-def _out_of_glass(everything: Adjustment, state: State) -> tuple[State, Bools, tuple[Floats, Floats, Floats]]:
-    """Take labels out of the mirrors in which they were found.
-
-    A label's image in a pane is as consistent as the label, and may be seen from more stops. But the robot and the
-    label are on the same side of the pane, so from every stop the image is farther away than the label: of two
-    positions that are equally high, as they are with upright glass, the nearer one is the label, unless it has so
-    little support that chance could have made it.
-
-    Returns
-    -------
-    state, reflected, hypotheses
-        With the labels at the nearer positions, the sightings (N,) that the farther ones explain, and what else these
-        leave to be said (see `_hypotheses`). The state is the one given if no label was taken out.
-    """
-    problem = everything.problem
-    reflected = np.zeros(len(problem.sightings), dtype=np.bool_)
-    for _ in range(_IMAGES):
-        gain, rivals, rival_gain = hypotheses = _hypotheses(everything, state, reflected)
-        swap = _level(problem, state, rivals) & _nearer(problem, state, rivals) & (rival_gain > _CHANCE * gain)
-        keep = _level(problem, state, rivals) & _farther(problem, state, rivals)
-        if not (swap | keep).any():
-            return state, reflected, hypotheses
-        images = np.where(keep[:, None], rivals, state.points)
-        _, shown = _support(everything, replace(state, points=images))
-        if swap.any():
-            state = replace(state, points=np.where(swap[:, None], rivals, state.points))
-        _, direct = _support(everything, state)
-        reflected |= (swap | keep)[problem.sightings.label] & shown & ~direct
-    return state, reflected, _hypotheses(everything, state, reflected)
-
-
-def _level(problem: Problem, state: State, rivals: Floats) -> Bools:
-    """(L,) labels whose rival position is as high as theirs; known labels are none: where they are was measured."""
-    level = np.abs(rivals[:, 2] - state.points[:, 2]) < _UPRIGHT_M
-    level[problem.known.label] = False
-    return level
-
-
-def _nearer(problem: Problem, state: State, rivals: Floats) -> Bools:
-    """(L,) labels whose rival position is nearer than theirs, on the plan, from every stop that saw them."""
-    return _compared(problem, state, state.points, rivals)
-
-
-def _farther(problem: Problem, state: State, rivals: Floats) -> Bools:
-    """(L,) the opposite: farther from every stop."""
-    return _compared(problem, state, rivals, state.points)
-
-
-def _compared(problem: Problem, state: State, far: Floats, near: Floats) -> Bools:
-    sightings = problem.sightings
-    at = problem.stop_entries(state)[sightings.stop, :2]
-    to_far = np.linalg.norm(far[sightings.label, :2] - at, axis=1)
-    to_near = np.linalg.norm(near[sightings.label, :2] - at, axis=1)
-    result = np.ones(len(far), dtype=np.bool_)
-    result[sightings.label[~(to_near < to_far)]] = False  # also where one of them is NaN: there is no rival
-    return result
-
-
-def _hypotheses(everything: Adjustment, state: State, without: Bools | None = None) -> tuple[Floats, Floats, Floats]:
-    """Support of each label's position, the best position that its other sightings propose, and that one's support.
-
-    Sightings `without` (N,) propose nothing. The support is the sum over groups of rivals of probability times
-    (1 - squared residual / threshold).
-    """
-    problem = everything.problem
-    nothing = Known(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
-    fixed = replace(problem, prior_sigma=np.zeros_like(problem.prior_sigma), known=nothing)
-    gain, explained_ = _support(everything, state)
-    rest = problem.sightings.select(~explained_ if without is None else ~(explained_ | without))
-    count = len(problem.labels)
-    none = np.full((count, 3), np.nan), np.zeros(count)
-    if len(rest) == 0:
-        return gain, *none
-    origin, direction = world_rays(fixed, rest, state)
-    points, found = triangulate(
-        origin, direction, rest.label, rest.stop, rest.probability, count, ray_tolerance(problem)
-    )
-    rest = rest.select(found[rest.label])
-    if len(rest) == 0:
-        return gain, *none
-    trial = replace(state, points=np.where(found[:, None], points, state.points))
-    adjustment = Adjustment(fixed, rest)
-    for loss in (Loss("geman-mcclure", 1.0), Loss("geman-mcclure")):
-        trial = adjustment.solve(trial, loss, iterations=12, tolerance=1e-2).state
-    rival_gain, fits = _support(everything, trial)
-    found &= stops_per_label(problem.sightings.label[fits], problem.sightings.stop[fits], count) >= 2
-    found &= np.linalg.norm(trial.points - state.points, axis=1) > 0.05
-    return gain, np.where(found[:, None], trial.points, np.nan), np.where(found, rival_gain, 0.0)
-
-
-def _in_floor(everything: Adjustment, state: State) -> Bools:
-    """Which sightings lie where the floor would mirror their label; its tilt and waves move images by some pixels."""
-    mirrored = replace(state, points=state.points * [1.0, 1.0, -1.0])
-    linear = everything.residuals(mirrored, SQUARE)
-    miss = np.linalg.norm(linear.residual, axis=1) * everything.sightings.sigma
-    return np.asarray(linear.valid & (miss < _FLOOR_IMAGE_PX))
-
-
-def _support(everything: Adjustment, state: State) -> tuple[Floats, Bools]:
-    sightings = everything.sightings
-    square = (everything.residuals(state, SQUARE).residual ** 2).sum(axis=1)
-    worth = sightings.probability * np.maximum(1.0 - square / OUTLIER, 0.0)
-    groups, owner = np.unique(sightings.rival, return_inverse=True)
-    best, label = np.zeros(len(groups)), np.zeros(len(groups), dtype=np.int64)
-    np.maximum.at(best, owner.ravel(), worth)
-    label[owner.ravel()] = sightings.label
-    gain = np.bincount(label, best, len(everything.problem.labels)).astype(np.float64)
-    return gain, np.asarray(square < OUTLIER)

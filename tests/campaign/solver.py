@@ -278,7 +278,8 @@ def test_uncertainties_are_true(name):
 
 @pytest.mark.parametrize("name", STORES)
 def test_uncertainties_of_missions_are_true(name):
-    assert 0.93 <= coverage(name, range(3 * SEEDS)) <= 0.97
+    # fewer missions leave it to chance: one error of the scale moves all labels of one
+    assert 0.93 <= coverage(name, range(10 * SEEDS)) <= 0.97
 
 
 def main():
@@ -302,7 +303,7 @@ def main():
             efficiency(name, range(arguments.first, arguments.first + 6 * arguments.seeds))
     if "coverage" in tables:
         for name in STORES:
-            coverage(name, seeds)
+            coverage(name, range(arguments.first, arguments.first + 10 * arguments.seeds))
 
 
 if __name__ == "__main__":
