@@ -23,6 +23,7 @@ _FLOOR_IMAGE_PX = 6.0
 _UPRIGHT_M = 0.03  # a label and its image in upright glass are equally high; what tilt and calibration leave
 _IMAGES = 4  # images of one label in different panes that are looked for
 _CHANCE = 0.25  # share of an image's support with which the label itself stands out from chance
+_TWO = 2.5  # support that three sightings have and two have not
 _TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
 _FEW_STOPS = 3  # that agree, up to which other sightings may be right and one of these wrong
 
@@ -33,12 +34,14 @@ class Hypotheses:
 
     The support is the sum over groups of rival sightings of probability times (1 - squared residual / threshold).
     `shared` are further rivals (L, 3) with their support (L,), which take some of the position's sightings along.
+    `chance` (L,) says whose rival is the label in front of its image, unless chance made it.
     """
 
     gain: Floats
     rivals: Floats
     rival_gain: Floats
     shared: tuple[tuple[Floats, Floats], ...] = ()
+    chance: Bools | None = None
 
     def tied(self, label: int) -> list[Floats]:
         """The rivals (3,) of a label that are as likely as its position, all of them apart from each other."""
@@ -46,6 +49,7 @@ class Hypotheses:
         for points, rival_gain in ((self.rivals, self.rival_gain), *self.shared):
             point, support_ = points[label], rival_gain[label]
             as_likely = gain - support_ < _TIE and support_ > _TIE * gain
+            as_likely |= points is self.rivals and self.chance is not None and bool(self.chance[label])
             if np.isfinite(point[0]) and as_likely and all(np.linalg.norm(point - p) > _APART_M for p in result):
                 result.append(point)
         return result
@@ -57,7 +61,7 @@ def out_of_glass(everything: Adjustment, state: State) -> tuple[State, Bools, Hy
     A label's image in a pane is as consistent as the label, and may be seen from more stops. But the robot and the
     label are on the same side of the pane, so from every stop the image is farther away than the label: of two
     positions that are equally high, as they are with upright glass, the nearer one is the label, unless it has so
-    little support that chance could have made it.
+    little support that chance could have made it: any two sightings of labels as high as the cameras meet.
 
     Returns
     -------
@@ -70,10 +74,12 @@ def out_of_glass(everything: Adjustment, state: State) -> tuple[State, Bools, Hy
     for _ in range(_IMAGES):
         found = hypotheses(everything, state, reflected)
         level = _level(problem, state, found.rivals)
-        swap = level & _nearer(problem, state, found.rivals) & (found.rival_gain > _CHANCE * found.gain)
+        nearer = level & _nearer(problem, state, found.rivals) & (found.rival_gain > _CHANCE * found.gain)
+        chance = nearer & (found.rival_gain < _TWO) & _at_camera_height(problem, found.rivals)
+        swap = nearer & ~chance
         keep = level & _farther(problem, state, found.rivals)
         if not (swap | keep).any():
-            return state, reflected, found
+            return state, reflected, replace(found, chance=chance)
         images = np.where(keep[:, None], found.rivals, state.points)
         _, shown = support(everything, replace(state, points=images))
         if swap.any():
@@ -88,6 +94,11 @@ def _level(problem: Problem, state: State, rivals: Floats) -> Bools:
     level = np.abs(rivals[:, 2] - state.points[:, 2]) < _UPRIGHT_M
     level[problem.known.label] = False
     return level
+
+
+def _at_camera_height(problem: Problem, rivals: Floats) -> Bools:
+    """(L,) rivals as high as some camera, so that every two of its sightings meet, whatever they are of."""
+    return np.asarray((np.abs(rivals[:, 2, None] - problem.t_robot_camera[:, 2]) < _UPRIGHT_M).any(axis=1))
 
 
 def _nearer(problem: Problem, state: State, rivals: Floats) -> Bools:
