@@ -22,7 +22,7 @@ from .problem import STOP, Bools, Ints, Problem, Sightings, State
 WEAK = 4  # shared labels up to which a tie is doubted
 _UNCHECKED = 2  # up to which one wrong identity goes unnoticed whatever is tried
 _LEAD = 4.0  # of the cost: half of what one sighting is worth
-_APART_M = 0.05  # between two optima's stops, to be two
+_APART_M = 0.02  # between two optima's stops, to be two
 _WINDOW = 10  # stops to either side within which a tie is doubted first
 _AGAIN = (Loss("cauchy", 7.5), Loss("cauchy", 2.5, width=2.0), Loss("geman-mcclure", 0.4))
 _JUDGE = Loss("geman-mcclure")
