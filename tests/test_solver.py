@@ -66,10 +66,10 @@ def test_reflections_and_wrong_identities_do_not_move_the_map(store, share):
     survey, truth = simulate(load(store), 1, world, outliers=share)
     score = evaluate(solve(survey), truth)
     errors = np.array(list(score.errors_mm.values()))
-    assert score.labels_placed >= (0.95 if share < 0.2 else 0.7) * len(truth)
+    # with a third of the sightings wrong, many labels keep one or two, which nothing confirms
+    assert score.labels_placed >= (0.95 if share < 0.2 else 0.55) * len(truth)
     assert np.median(errors) < 30.0
-    # a label with as many wrong as right sightings may be wrong; more than a few such there are not
-    assert (errors > 100.0).mean() <= (0.03 if share < 0.2 else 0.15)
+    assert (errors > 100.0).mean() <= 0.03
 
 
 def test_odometry_poses_as_poor_as_the_thesis_start_do_not_matter():

@@ -160,6 +160,32 @@ def test_a_label_at_camera_height_of_which_any_two_sightings_meet_is_not_placed_
     assert label_of(solve(two), "N17").status == "placed"
 
 
+@pytest.mark.parametrize(("wrong", "status"), [(0.0, "placed"), (0.3, "unplaced")])
+def test_two_sightings_at_camera_height_are_believed_only_where_nearly_all_others_fit(wrong, status):
+    store = load("room")
+    level = next(label for label in store["labels"] if label["id"] == "N17")
+    level["position"][2] = 0.5
+    world = replace(World(), reflections=0.0, wrong_ids=0.0)
+    right, _ = simulate(store, 3, world)
+    seen = [s.stop for s in right.stops if any(g.label == "N17" for g in s.sightings)][:2]
+    survey, _ = simulate(store, 3, world, outliers=wrong)
+    stops = []
+    for stop, good in zip(survey.stops, right.stops, strict=True):
+        mine = [g for g in good.sightings if g.label == "N17" and stop.stop in seen][:1]
+        stops.append(replace(stop, sightings=(*(g for g in stop.sightings if g.label != "N17"), *mine)))
+    label = label_of(solve(replace(survey, stops=tuple(stops))), "N17")
+    assert (label.status, label.sightings) == (status, 2)
+    assert status == "placed" or "whatever they are of" in label.reason
+
+
+def test_a_few_sightings_of_a_neighbour_under_a_labels_name_do_not_draw_it_there():
+    survey, truth = quiet_room()
+    near = [s.stop for s in survey.stops if any(g.label == "H27" for g in s.sightings)]
+    label = label_of(solve(shown_at(survey, "W21", truth["H27"], near[-2:])), "W21")
+    assert label.status == "placed"
+    np.testing.assert_allclose(label.position, truth["W21"], atol=1e-4)
+
+
 def test_every_sighting_is_accounted_for():
     survey, _ = noisy_room()
     result = solve(survey)

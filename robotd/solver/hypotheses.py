@@ -19,6 +19,7 @@ from .problem import Bools, Known, Problem, State, stops_per_label
 from .weights import OUTLIER
 
 _APART_M = 0.02  # between two positions, to be two
+_SAME_PLACE_M = 0.03  # two labels hang farther apart
 _FLOOR_IMAGE_PX = 6.0
 _UPRIGHT_M = 0.03  # a label and its image in upright glass are equally high; what tilt and calibration leave
 _IMAGES = 4  # images of one label in different panes that are looked for
@@ -61,7 +62,8 @@ def out_of_glass(everything: Adjustment, state: State) -> tuple[State, Bools, Hy
     A label's image in a pane is as consistent as the label, and may be seen from more stops. But the robot and the
     label are on the same side of the pane, so from every stop the image is farther away than the label: of two
     positions that are equally high, as they are with upright glass, the nearer one is the label, unless it has so
-    little support that chance could have made it: any two sightings of labels as high as the cameras meet.
+    little support that chance could have made it: any two sightings of labels as high as the cameras meet. Nor is it
+    where another label hangs, whose sightings got this one's name.
 
     Returns
     -------
@@ -75,7 +77,8 @@ def out_of_glass(everything: Adjustment, state: State) -> tuple[State, Bools, Hy
         found = hypotheses(everything, state, reflected)
         level = _level(problem, state, found.rivals)
         nearer = level & _nearer(problem, state, found.rivals) & (found.rival_gain > _CHANCE * found.gain)
-        chance = nearer & (found.rival_gain < _TWO) & _at_camera_height(problem, found.rivals)
+        nearer &= ~_another_hangs_there(state, found, nearer)
+        chance = nearer & (found.rival_gain < _TWO) & at_camera_height(problem, found.rivals)
         swap = nearer & ~chance
         keep = level & _farther(problem, state, found.rivals)
         if not (swap | keep).any():
@@ -96,9 +99,14 @@ def _level(problem: Problem, state: State, rivals: Floats) -> Bools:
     return level
 
 
-def _at_camera_height(problem: Problem, rivals: Floats) -> Bools:
-    """(L,) rivals as high as some camera, so that every two of its sightings meet, whatever they are of."""
-    return np.asarray((np.abs(rivals[:, 2, None] - problem.t_robot_camera[:, 2]) < _UPRIGHT_M).any(axis=1))
+def _another_hangs_there(state: State, found: Hypotheses, asked: Bools) -> Bools:
+    """(L,) labels, of those `asked`, whose rival position is another label's, with less support than their own."""
+    result = np.zeros(len(asked), dtype=np.bool_)
+    for i in np.flatnonzero(asked & (found.rival_gain < found.gain)):
+        near = np.linalg.norm(state.points - found.rivals[i], axis=1) < _SAME_PLACE_M
+        near[i] = False
+        result[i] = near.any()
+    return result
 
 
 def _nearer(problem: Problem, state: State, rivals: Floats) -> Bools:
@@ -119,6 +127,11 @@ def _compared(problem: Problem, state: State, far: Floats, near: Floats) -> Bool
     result = np.ones(len(far), dtype=np.bool_)
     result[sightings.label[~(to_near < to_far)]] = False  # also where one of them is NaN: there is no rival
     return result
+
+
+def at_camera_height(problem: Problem, points: Floats) -> Bools:
+    """(L,) points (L, 3) as high as some camera, so that any two sightings meet there, whatever they are of."""
+    return np.asarray((np.abs(points[:, 2, None] - problem.t_robot_camera[:, 2]) < _UPRIGHT_M).any(axis=1))
 
 
 def behind_glass(problem: Problem, state: State, rivals: Floats) -> Bools:

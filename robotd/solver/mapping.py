@@ -27,6 +27,7 @@ from ..records import (
 from ..sighting_columns import made
 from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
+from .hypotheses import at_camera_height
 from .initial import world_rays
 from .known_labels import on_a_line
 from .linear import solve_linear
@@ -40,6 +41,7 @@ from .weights import OUTLIER
 WIDEST_SIGMA_M = 0.25  # a label less certain than this would be written to the wrong shelf
 _TRUSTED_STOPS = 4  # agreement from as many is no chance, however many other sightings disagree
 _OUTSIDE_M = 0.5  # a position so far outside all others may be an image in a shop window or a glossy shelf
+_ALL_BUT_ALL = 0.9  # share of the survey's sightings that fit, below which two are not believed that nothing checks
 _SAME_PLACE_M = 0.05
 _SURPRISE = 21.1  # chi square of 3 degrees of freedom that chance exceeds once in 10 000
 _CLEARLY_NEARER_M = 0.2
@@ -136,7 +138,7 @@ class _Tally:
     `row` is its place in the adjustment or -1, `known` in the problem's known labels or -1, `sigma` its largest
     standard deviation, `position` and `covariance` as in the map, the latter by row, `agreeing` and `doubting` sums of
     its sightings' probabilities, `in_front` (L, 3) see _in_front, `elsewhere` (L,) see _elsewhere, `in_glass` see
-    _in_glass.
+    _in_glass; `unchecked` (L,) are those whose two sightings meet wherever these point, because they are level.
     """
 
     asked_stops: list[int]
@@ -153,6 +155,7 @@ class _Tally:
     in_front: Floats
     image: list[bool]
     elsewhere: Bools
+    unchecked: Bools
     in_glass: dict[int, tuple[str, Floats | None]]
 
 
@@ -165,6 +168,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
     sigma = np.full(count, np.inf)
     if len(points := optimum.covariance.points):
         sigma[optimum.adjustment.labels] = np.sqrt(np.linalg.eigvalsh(points)[:, -1])
+    inliers = np.bincount(s.label[inlier], minlength=count)
     in_front = _in_front(optimum)
     image: list[bool] = np.isfinite(in_front[:, 0]).tolist()
 
@@ -175,7 +179,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
     return _Tally(
         asked_stops=stops(asked.sightings),
         stops=stops(s),
-        inliers=np.bincount(s.label[inlier], minlength=count).tolist(),
+        inliers=inliers.tolist(),
         agreeing_stops=stops(s.select(inlier)),
         agreeing=np.bincount(s.label[inlier], s.probability[inlier], count).tolist(),
         doubting=np.bincount(s.label[odd], s.probability[odd], count).tolist(),
@@ -189,6 +193,8 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
         in_front=in_front,
         image=image,
         elsewhere=_elsewhere(optimum),
+        unchecked=at_camera_height(problem, optimum.state.points)
+        & (np.bincount(s.label[inlier], minlength=count) == 2),
         in_glass=_in_glass(optimum),
     )
 
@@ -221,6 +227,11 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
         )
     if tally.agreeing_stops[i] < _TRUSTED_STOPS and tally.doubting[i] >= tally.agreeing[i]:
         return unplaced(f"only {inliers} of its {count} sightings agree, which may be chance; flash it again, alone")
+    if tally.unchecked[i] and doubt.share < _ALL_BUT_ALL:
+        return unplaced(
+            f"two sightings meet at the cameras' height, whatever they are of, and only {100 * doubt.share:.0f} % of "
+            "the survey's sightings fit; map it from a third stop"
+        )
     if doubt.refused or (doubt.share < FITS and (doubt.share < FITS_NOT or tally.agreeing_stops[i] < _TRUSTED_STOPS)):
         return unplaced(
             "the survey as a whole is doubtful; see the map's notes"
