@@ -28,7 +28,7 @@ from .errors import ConfigError, InputError
 from .plan_records import Plan
 from .records import Map, Stop, Survey, Vector3
 from .survey_checks import Problems, check_header, check_map, check_stop, check_stops
-from .typed_json import decode, repeated_keys
+from .typed_json import decode, repeated_keys, with_infinite
 
 R = TypeVar("R")
 Points = dict[str, tuple[Vector3, float | None]]
@@ -167,7 +167,10 @@ def _table(data: bytes, where: str, formats: tuple[str, ...]) -> dict[str, Any]:
         table = msgspec.json.decode(data)
         repeated = repeated_keys(data)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{where}: not valid JSON{_place(data, error)}") from error
+        lenient = with_infinite(data)
+        if lenient is None or (formats and lenient.get("format") not in formats):
+            raise InputError(f"{where}: not valid JSON{_place(data, error)}") from error
+        table, repeated = lenient, []  # what reads its fields names each number with its place, and refuses it
     except (RecursionError, ValueError) as error:
         text = "nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise InputError(f"{where}: not valid JSON: {text}") from error

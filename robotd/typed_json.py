@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import gc
 import json
+import math
 import types
 import typing
 from collections.abc import Iterator
@@ -118,3 +119,20 @@ def _mirrored(hint: Any) -> Any:
     if origin in (Union, types.UnionType):
         return functools.reduce(lambda a, b: a | b, arguments)
     return hint if origin is None or origin is typing.Literal else origin[arguments]
+
+
+def with_infinite(data: bytes) -> dict[str, Any] | None:
+    """The object if all that keeps it from being JSON are numbers that are not finite, as many programs write them."""
+    try:
+        table = json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(table, dict):
+        return None
+    left: list[Any] = [table]
+    while left:
+        value = left.pop()
+        if isinstance(value, float) and not math.isfinite(value):
+            return table
+        left += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return None

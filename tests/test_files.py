@@ -266,6 +266,16 @@ def test_what_is_not_a_survey_at_all_is_refused_with_the_place(data, part):
     assert part in str(caught.value)
 
 
+def test_numbers_that_are_not_finite_are_named_by_stop_and_field_with_all_other_mistakes():
+    table = changed(EXAMPLE, ["stops", 0, "sightings", 0, "u"], float("nan"))
+    table["stops"][1]["move"]["covariance"][2][2] = float("inf")
+    table["rig"]["cameras"][0]["size"] = [0, 0]
+    text = "\n".join(problems_of(table))
+    assert "stops[0].sightings[0].u: found nan; expected a finite number" in text
+    assert "stops[1].move.covariance[2][2]: found inf" in text
+    assert "cameras[0].size" in text
+
+
 # ---- round trips -----------------------------------------------------------------------------------------------------
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
