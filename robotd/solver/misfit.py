@@ -143,7 +143,7 @@ def _best_reading(asked: Problem, seen: Strain) -> tuple[Reading, str, Strain] |
     best: tuple[Reading, Optimum, Strain] | None = None
     for reading in _readings(asked, seen):
         try:
-            optimum = optimise(build_problem(reading.survey))
+            optimum = optimise(build_problem(reading.survey), thorough=False)
         except InputError:  # read like that it would be impossible
             continue
         other = strain(optimum)
@@ -173,7 +173,9 @@ def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
     if asked.frame == "first stop":
         yield from nearly(survey) if seen.share >= _UNSURE else lengths(survey)
     if everything or seen.share < 0.5 * (FITS + _MOSTLY):
-        yield from chain(signs(survey), rigs(survey))
+        for reading in chain(signs(survey), rigs(survey)):
+            if reading.kind != CAMERAS or seen.share < _MOSTLY:  # exchanged cameras leave no survey that fits
+                yield reading
     if not seen.scatters and (everything or seen.chance < _IMPOSSIBLE):
         yield from lenses(survey)
 

@@ -10,6 +10,7 @@ from ..geometry.transforms import heading_matrix, se2_compose, se2_inverse
 from ..records import Floats
 from .initial import chain, locate, triangulate, world_rays
 from .problem import ODOMETRY, STOP, Bools, Ints, Known, Problem, State
+from .wheel_errors import LOST
 
 _LABELS_TO_JOIN = 3  # shared labels that must agree before two runs of odometry are joined
 
@@ -24,9 +25,9 @@ class Placement:
 
 
 def segments(problem: Problem) -> Ints:
-    """(S,) number of the unbroken run of moves that each stop belongs to."""
-    linked = np.zeros(problem.stop_count, dtype=np.bool_)
-    linked[problem.moves.after] = True
+    """(S,) number of the unbroken run of moves that each stop belongs to; a lost move breaks it."""
+    moves, linked = problem.moves, np.zeros(problem.stop_count, dtype=np.bool_)
+    linked[moves.after[moves.covariance[:, 2, 2] < LOST[2, 2]]] = True
     return np.cumsum(~linked) - 1
 
 

@@ -14,26 +14,27 @@ import numpy as np
 
 from ..geometry.transforms import se2_relative
 from ..records import Floats
+from .breaks import torn_moves, without_moves
 from .bundle import SQUARE, Adjustment, Loss, Solution
 from .covariance import Covariance, covariance
 from .hypotheses import Hypotheses, behind_glass, hypotheses, in_floor, out_of_glass, support, with_shared
 from .initial import epipolar_moves
 from .known_labels import contradicted, difference, slipped
 from .placement import Placement, at_first_stop, detach, place, ray_tolerance, retriangulate
-from .problem import Bools, Ints, Problem, State, anchors, stops_per_label
+from .problem import Bools, Problem, State, stops_per_label
 from .tie_sightings import without_ties
 from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
-from .wheel_errors import slip_covariance
+from .wrong import with_lost_moves, without_known, without_wrong
 
-_SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
-_WRONG_KNOWN = 25.0
 _REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tell them apart, slack on the lens
 _EXPLAINED = 0.25  # weight of a sighting under that loss from which it counts as explained
 _ENOUGH = 20  # sightings at a stop, to begin with
 _FEW_DOUBTS = 0.001  # share of sightings not explained, below which labels are not triangulated once more
 _CLEAN = 0.97  # share of sightings explained at which no other start can do better
 _SAME = 0.5  # difference of two starts' costs below which they found the same minimum
+_BREAKS = 4  # times that moves are looked for which are not the robot's
+_JOINED = 3  # sightings that must fit in addition without them
 _MEDIAN = 2.0 * np.log(2.0)  # of the squared length of a standard normal vector in the plane
 
 
@@ -82,12 +83,17 @@ class Optimum:
     converged: bool
 
 
-def optimise(problem: Problem, start: Floats | None = None, grown: Placement | None = None) -> Optimum:
+def optimise(
+    problem: Problem, start: Floats | None = None, grown: Placement | None = None, thorough: bool = True
+) -> Optimum:
     """Find the poses, rig and points that explain the sightings, whatever else is among them.
 
     `start` (S, 3) holds x, y, heading of every stop to begin from; by default those that odometry chains. `grown` is
-    tried before all starts: a state near the optimum, for instance that of the same survey without its last stop.
+    tried before all starts: a state near the optimum, for instance that of the same survey without its last stop. If
+    not `thorough`, breaks in legs and weak ties are not looked for: enough to say how well a survey fits.
     """
+    if not thorough:
+        return _from_starts(problem, start, grown, thorough)
     optimum = _optimise(problem, start, grown)
     if not contradicted(problem, optimum.problem, optimum.state.points):
         return optimum
@@ -108,8 +114,22 @@ def optimise(problem: Problem, start: Floats | None = None, grown: Placement | N
 
 
 def _optimise(problem: Problem, start: Floats | None, grown: Placement | None) -> Optimum:
+    optimum = _from_starts(problem, start, grown)
+    for _ in range(_BREAKS):
+        torn = torn_moves(optimum.problem, optimum.inlier)
+        if len(torn) == 0:
+            break
+        problem = without_moves(problem, torn)
+        other = _from_starts(problem, start, None)
+        if np.count_nonzero(other.inlier) < np.count_nonzero(optimum.inlier) + _JOINED:
+            break
+        optimum = other
+    return optimum
+
+
+def _from_starts(problem: Problem, start: Floats | None, grown: Placement | None, thorough: bool = True) -> Optimum:
     problem, placement, solution, iterations = _best_start(problem, start, grown)
-    return _finish(detach(problem, placement.placed), placement.placed, solution.state, iterations)
+    return _finish(detach(problem, placement.placed), placement.placed, solution.state, iterations, thorough)
 
 
 def _best_start(
@@ -188,7 +208,7 @@ def _weights(adjustment: Adjustment, state: State) -> Floats:
     return _REFERENCE((adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1))[1]
 
 
-def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> Optimum:
+def _finish(problem: Problem, placed: Bools, state: State, iterations: int, thorough: bool) -> Optimum:
     stated = problem.sightings.sigma
     everything = Adjustment(problem, problem.sightings)
     factor = _scatter(everything, state)
@@ -198,14 +218,16 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
     tolerance = max(1e-2, 1e-5 * len(problem.sightings))
     solution = everything.solve(state, Loss("geman-mcclure"), iterations=30, tolerance=tolerance, damping=1e-6)
     iterations, state = iterations + solution.iterations, solution.state
-    state, rival = doubted(problem, state, problem.sightings.select(support(everything, state)[1]))
+    rival: Rival | None = None
+    if thorough:
+        state, rival = doubted(problem, state, problem.sightings.select(support(everything, state)[1]))
     state, reflected, found = out_of_glass(everything, state)
     if reflected.any():
         found = hypotheses(everything, state)
     better = (found.rival_gain > found.gain) & ~behind_glass(problem, state, found.rivals)
     if better.any():
         state = replace(state, points=np.where(better[:, None], found.rivals, state.points))
-        problem = _without_known(problem, state, np.flatnonzero(better[problem.known.label]))
+        problem = without_known(problem, state, np.flatnonzero(better[problem.known.label]))
     for attempt in range(2):
         everything, state, inlier, adjustment, spent, converged = _least_squares(everything, state)
         problem = everything.problem
@@ -224,6 +246,7 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int) -> O
         state = kept
         found = hypotheses(everything, state, reflected)
     found = with_shared(everything, state, found, reflected)
+    problem = with_lost_moves(problem, state)
     factor = float(np.median(problem.sightings.sigma / stated)) if len(stated) else 1.0
     if factor > 1.0:
         note = f"sightings scatter {factor:.1f} times as much as their sigma_px says; uncertainties were scaled"
@@ -252,7 +275,7 @@ def _least_squares(everything: Adjustment, state: State) -> tuple[Adjustment, St
     inlier: Bools | None = None
     iterations = 0
     for _ in range(8):
-        problem = _without_wrong(everything, state)
+        problem = without_wrong(everything, state)
         same = problem is everything.problem
         if not same:
             everything = Adjustment(problem, problem.sightings)
@@ -281,62 +304,6 @@ def explained(everything: Adjustment, state: State) -> Bools:
     stops = stops_per_label(sightings.label[good], sightings.stop[good], len(problem.labels))
     stops[problem.known.label] += 1
     return np.asarray(good & (stops[sightings.label] >= 2))
-
-
-def _without_wrong(everything: Adjustment, state: State) -> Problem:
-    """Loosen moves that disagree with everything else (wheels slip) and drop known labels that do.
-
-    Returns the problem itself if nothing was wrong.
-    """
-    problem = everything.problem
-    linear = everything.residuals(state, SQUARE)
-    moves, known, notes = problem.moves, problem.known, list(problem.notes)
-    excess = (linear.move**2).sum(axis=1)
-    slipped, motions = excess[: len(moves.before)] > _SLIP, problem.motions
-    wrong = excess[len(moves.before) :] > _SLIP
-    if wrong.any():
-        for k in np.flatnonzero(wrong):
-            stop, sigmas = problem.survey.stops[motions.after[k]], np.sqrt(excess[len(moves.before) + k])
-            at = f"leg {stop.leg} stop {stop.stop}: the motion by {motions.source[k]}"
-            notes.append(f"{at} is {sigmas:.0f} standard deviations from what all else says; it was not used")
-        problem = replace(problem, motions=motions.select(~wrong), notes=tuple(notes))
-    if slipped.any():
-        covariance_ = np.where(
-            slipped[:, None, None], moves.covariance + slip_covariance(moves.measured), moves.covariance
-        )
-        moves = replace(moves, covariance=covariance_)
-        for m in np.flatnonzero(slipped):
-            stop = problem.survey.stops[moves.after[m]]
-            sigmas = float(np.sqrt((linear.move[m] ** 2).sum()))
-            at = f"leg {stop.leg} stop {stop.stop}: the move to it"
-            if not any(note.startswith(at) for note in notes):
-                said = f"{sigmas:.0f} standard deviations from what the sightings say"
-                notes.append(f"{at} is {said}; treated as a wheel slip")
-        problem = replace(problem, moves=moves, notes=tuple(notes))
-    excess = np.linalg.norm(state.points[known.label] - known.position, axis=1) / known.sigma
-    excess[~np.isin(known.label, problem.sightings.label)] = 0.0
-    worst = np.argsort(excess)[-1:]  # one at a time, because a wrong one drags others with it
-    return _without_known(problem, state, worst[excess[worst] ** 2 > _WRONG_KNOWN])
-
-
-def _without_known(problem: Problem, state: State, wrong: Ints) -> Problem:
-    """Drop wrong known labels and name them, as long as enough remain to fix the world frame."""
-    for k in sorted(wrong.tolist(), reverse=True):
-        known = problem.known
-        miss = 1000.0 * float(np.linalg.norm(state.points[known.label[k]] - known.position[k]))
-        named = f"known label {problem.labels[known.label[k]]} is"
-        if any(note.startswith(named) for note in problem.notes):
-            continue
-        said = f"{named} {miss:.0f} mm from where the sightings put it"
-        keep = np.arange(len(known.label)) != k
-        rest = replace(known, label=known.label[keep], position=known.position[keep], sigma=known.sigma[keep])
-        if problem.frame == "known labels" and not anchors(rest, problem.sightings):
-            note = f"{said}, but too few others fix the world frame; measure a third label"
-            problem = replace(problem, notes=(*problem.notes, note))
-        else:
-            note = f"{said}; its measured position was not used"
-            problem = replace(problem, known=rest, notes=(*problem.notes, note))
-    return problem
 
 
 def _scatter(everything: Adjustment, state: State) -> float:

@@ -8,6 +8,7 @@ from ..records import Floats, Move, Priors
 
 EXACT = 1e-12  # of a prior: so little that its information would drown all other in rounding
 SLIPPED = np.diag([0.05, 0.05, 0.25]) ** 2  # of a slipped move, where it ended: one wheel spun for some centimetres
+LOST = np.diag([1e3, 1e3, 1e3]) ** 2  # of a move that says nothing: somebody carried or pushed the robot
 _SAME_MOVE_M = 1e-3
 
 
