@@ -16,15 +16,17 @@ def add_calibrate_camera(kinds: argparse._SubParsersAction[argparse.ArgumentPars
         "camera",
         help="a camera's lens, from pictures of a chessboard or ChArUco board, or from MATLAB",
         description="Hold a flat, stiff board before the camera in 20 pictures: near and far, tilted by 30 to 45"
-        " degrees to all sides, and out to every border of the picture. An IMAGE may be a folder that `robotctl"
-        " calibrate camera` made; it says which board it was.",
+        " degrees to all sides, and out to every border of the picture. An IMAGE may be a folder: of pictures, or"
+        " one that `robotctl calibrate camera` made, which says which board it was.",
     )
-    camera.add_argument("images", nargs="*", type=Path, metavar="IMAGE", help="pictures, or one folder")
+    camera.add_argument("images", nargs="*", type=Path, metavar="IMAGE", help="pictures, or folders of them")
     board = camera.add_mutually_exclusive_group()
     board.add_argument("--board", type=_inner, metavar="COLSxROWS", help="chessboard: its inner corners, such as 9x6")
     board.add_argument("--charuco", type=_inner, metavar="COLSxROWS", help="ChArUco board: its squares, such as 8x5")
     board.add_argument("--matlab", type=Path, metavar="FILE", help=".mat or .json with toStruct(cameraParams)")
-    camera.add_argument("--square", type=metres, metavar="M", help="side of a square in metres")
+    camera.add_argument(
+        "--square", type=metres, metavar="M", help="side of a square in metres; the lens does not depend on it"
+    )
     camera.add_argument(
         "--marker", type=metres, metavar="M", help="side of a ChArUco marker (default: 3/4 of a square)"
     )

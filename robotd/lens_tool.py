@@ -5,30 +5,28 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from .config import Calibration, load_calibration, save_lens
 from .errors import InputError
 from .files import read_bytes
-from .records import CameraModel, Floats, Priors
-from .solver.calibrate_floor import Board, find_board
+from .records import CameraModel, Priors
+from .solver.board_corners import Bytes, Charuco, Chessboard, Finder, dictionary_size
+from .solver.calibrate_floor import Board
 from .solver.calibrate_lens import ORDER, LensCalibration, calibrate_lens
 from .solver.lens_fit import View
 from .solver.lens_picture import draw_residuals
 from .solver.matlab_lens import load_matlab
 
-Bytes = NDArray[np.uint8]
-Finder = Callable[[Bytes], tuple[Floats, Floats] | None]
-LEAST_CORNERS = 8  # of a ChArUco board in a picture
 FORMAT = "robotd-calibration-data/1"
-_WINDOW = 0.3  # of the smallest square: half the side of the window in which a corner is refined
+KINDS = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")  # taken of a folder
+LEAST_SEEN = 3  # pictures with the board, from which the lens itself says what is missing
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -45,25 +43,33 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.matlab is not None:
         return _from_matlab(arguments, before)
     paths, board, square = _pictures(arguments)
-    finder = _charuco(arguments, square) if arguments.charuco else _chessboard(Board(*board, square))
+    finder: Finder = _charuco(arguments, square) if arguments.charuco else Chessboard(Board(*board, square))
     views, size = _views(paths, finder)
     kinds = ORDER if arguments.model == "auto" else (arguments.model,)
     result = calibrate_lens(views, size, arguments.camera, kinds, not arguments.partial)
     sigmas = result.sigmas.tolist()
     raised = Priors(focal_px=round(max(sigmas[:2]), 3), centre_px=round(max(sigmas[2:]), 3))
     if arguments.picture is not None:
-        draw_residuals(arguments.picture, result, views)
+        draw_residuals(arguments.picture, result)
     save_lens(result.camera, arguments.calibration, raised)
     if arguments.json:
-        print(json.dumps(_summary(result, views)))
+        print(json.dumps(_summary(result)))
     numbers = ", ".join(
         f"{what} {value:.2f} +- {sigma:.2f}"
         for what, value, sigma in zip(("fx", "fy", "cx", "cy"), result.camera.matrix, sigmas, strict=True)
     )
-    _say(f"{len(views)} pictures, {result.kind} {result.rms_px:.3f} px rms; {numbers} px")
+    corners = sum(len(view.points) for view in result.views)
+    _say(f"{len(views)} pictures, {corners} corners, {result.kind} {result.rms_px:.3f} px rms; {numbers} px")
+    if result.left_out:
+        _say(f"{result.left_out} corners were found in the wrong place and left out")
     _say(f"held out, px rms: {result.held_out_words}")
     for words in result.doubts:
         _say(words)
+    near, far = result.distances
+    _say(
+        f"the board was held {near:.2f} to {far:.2f} m away; if that is wrong, so is --square, on which the lens does"
+        " not depend (a floor camera's place does)"
+    )
     _say(
         f"the lens holds up to {result.reach_px:.0f} px from its centre, in {100.0 * result.share:.0f} % of the picture"
     )
@@ -99,14 +105,24 @@ def _say(words: str) -> None:
 
 def _pictures(arguments: argparse.Namespace) -> tuple[list[Path], tuple[int, int], float]:
     """The pictures, the chessboard's inner corners (of no meaning with --charuco) and the side of a square."""
-    paths, board, square = arguments.images, arguments.board or arguments.charuco, arguments.square
-    if len(paths) == 1 and paths[0].is_dir():
-        paths, told, side = _folder(paths[0], arguments.camera)
-        if board is None:
-            board, square = told, square or side
+    paths: list[Path] = []
+    board, square = arguments.board or arguments.charuco, arguments.square
     problems = []
-    if not paths:
-        problems.append("no pictures given; name them, or a folder that robotctl calibrate camera made")
+    for path in arguments.images:
+        if not path.is_dir():
+            paths.append(path)
+        elif (path / "data.json").exists():
+            some, told, side = _folder(path, arguments.camera)
+            paths += some
+            if board is None:
+                board, square = told, square or side
+        else:
+            found = sorted(one for one in path.iterdir() if one.suffix.lower() in KINDS)
+            paths += found
+            if not found:
+                problems.append(f"{path}: holds no picture ({', '.join(KINDS)}), nor data.json of robotctl calibrate")
+    if not paths and not problems:
+        problems.append("no pictures given; name them, or a folder of them, such as robotctl calibrate camera makes")
     if board is None:
         problems.append("the board is not known; give --board COLSxROWS or --charuco COLSxROWS")
     if square is None:
@@ -137,96 +153,77 @@ def _folder(folder: Path, camera: str) -> tuple[list[Path], tuple[int, int], flo
 def _views(paths: list[Path], finder: Finder) -> tuple[list[View], tuple[int, int]]:
     """The corners in every picture that shows the board, and the pictures' size.
 
-    Pictures without it are left out, and told, as long as most have it. Raises InputError that names every useless one.
+    Pictures without it are left out, and told. Raises InputError that names every useless one if a file is of no use,
+    or hardly any shows the board.
     """
+    images: dict[Path, Bytes] = {}
     problems: list[str] = []
-    blank: list[str] = []
-    views: list[View] = []
-    size: tuple[int, int] | None = None
     for path in paths:
         if not path.is_file():
             problems.append(f"{path}: there is no such file")
-            continue
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
-        if image is None:
+        elif (image := _read(path)) is None:
             problems.append(f"{path}: cannot be read as an image")
-            continue
+        else:
+            images[path] = image
+    sizes = Counter((image.shape[1], image.shape[0]) for image in images.values())
+    size = max(sizes, key=lambda one: sizes[one], default=(0, 0))
+    for path, image in images.items():
         height, width = image.shape
-        size = size or (width, height)
         if (width, height) != size:
+            turned = "; it is turned by 90 degrees" if (height, width) == size else ""
             problems.append(
-                f"{path}: is {width}x{height}, but {paths[0]} is {size[0]}x{size[1]}; all must come from one camera"
+                f"{path}: is {width}x{height}, but {sizes[size]} of {len(images)} are {size[0]}x{size[1]}{turned}; all"
+                " must come from one camera, as it delivers them"
             )
+    views: list[View] = []
+    blank: list[Path] = []
+    for path, image in images.items():
+        if (image.shape[1], image.shape[0]) != size:
             continue
-        found = finder(np.asarray(image, np.uint8))
+        found = finder.find(image)
         if found is None:
-            blank.append(f"{path}: the board is not seen")
-            continue
-        views.append(View(str(path), *found))
-    if problems or size is None or len(blank) >= len(views):
-        raise InputError(*problems, *(f"{one}; leave it out, or check the board's numbers" for one in blank))
-    for one in blank:
-        _say(f"{one}; it is left out")
+            blank.append(path)
+        else:
+            views.append(View(str(path), *found))
+    unseen = [f"{path}: the board is not seen" for path in blank]
+    if problems:
+        raise InputError(*problems, *unseen)
+    if blank and len(blank) >= len(views):
+        why = finder.explain([images[path] for path in blank])
+        if len(views) < LEAST_SEEN:
+            raise InputError(
+                *unseen,
+                f"the board is seen in {len(views)} of {len(images)} pictures: {why}",
+            )
+        _say(f"the board is seen in {len(views)} of {len(images)} pictures only: {why}")
+    for words in unseen:
+        _say(f"{words}; it is left out")
     return views, size
 
 
-def _chessboard(board: Board) -> Finder:
-    points = _flat(board.corners * [1.0, -1.0])  # y down, so that z points away from the camera
-
-    def find(image: Bytes) -> tuple[Floats, Floats] | None:
-        corners = find_board(image, board)
-        return None if corners is None else (points, _refined(image, corners, board))
-
-    return find
-
-
-def _refined(image: Bytes, corners: Floats, board: Board) -> Floats:
-    """Corners where the grey levels around them turn: the detector's are off by 0.1 px where boards are much tilted."""
-    grid = corners.reshape(board.rows, board.columns, 2)
-    apart = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min()) for axis in (0, 1))
-    half = max(2, int(_WINDOW * apart))
-    start = corners.astype(np.float32).reshape(-1, 1, 2)
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
-    return np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), stop), dtype=np.float64).reshape(-1, 2)
+def _read(path: Path) -> Bytes | None:
+    """A picture in grey, as the camera delivered it; None if it is none. Deeper ones are scaled to their brightest."""
+    data = np.fromfile(path, np.uint8)
+    how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, how) if len(data) else None
+    if image is None or image.dtype == np.uint8:
+        return None if image is None else np.asarray(image, np.uint8)
+    top = float(np.max(image, initial=0.0, where=np.isfinite(image)))
+    return np.asarray(np.clip(np.nan_to_num(image) * (255.0 / max(top, 1e-9)), 0.0, 255.0), np.uint8)
 
 
-def _charuco(arguments: argparse.Namespace, square: float) -> Finder:
-    number = getattr(cv2.aruco, arguments.dictionary, None)
-    if not arguments.dictionary.startswith("DICT_") or not isinstance(number, int):
-        names = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+def _charuco(arguments: argparse.Namespace, square: float) -> Charuco:
+    count = dictionary_size(arguments.dictionary)
+    if not count:
+        names = ", ".join(name for name in dir(cv2.aruco) if dictionary_size(name))
         raise InputError(f"--dictionary: found {arguments.dictionary!r}; expected one of {names}")
     marker = arguments.marker or 0.75 * square
     if marker >= square:
         raise InputError(f"--marker: found {marker:g} m; expected less than --square, {square:g} m")
-    detectors = []
-    dictionary = cv2.aruco.getPredefinedDictionary(number)
-    if arguments.charuco[0] * arguments.charuco[1] // 2 > len(dictionary.bytesList):
+    if arguments.charuco[0] * arguments.charuco[1] // 2 > count:
         raise InputError(f"--dictionary: {arguments.dictionary} has too few markers for that board; name a larger one")
-    for legacy in (False, True):  # boards printed before OpenCV 4.6 begin with the other colour
-        board = cv2.aruco.CharucoBoard(arguments.charuco, square, marker, dictionary)
-        board.setLegacyPattern(legacy)
-        detectors.append(cv2.aruco.CharucoDetector(board))
-    points = np.asarray(detectors[0].getBoard().getChessboardCorners(), dtype=np.float64)
-
-    def find(image: Bytes) -> tuple[Floats, Floats] | None:
-        best: tuple[Floats, Floats] | None = None
-        for detector in detectors:
-            corners, ids, _, _ = detector.detectBoard(image)
-            if ids is None or len(ids) < LEAST_CORNERS or (best is not None and len(ids) <= len(best[0])):
-                continue
-            there = points[np.asarray(ids).ravel()]
-            if (
-                np.linalg.matrix_rank(there - there.mean(axis=0), 0.3 * square) == 2
-            ):  # corners of one row say too little
-                best = there, np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        return best
-
-    return find
-
-
-def _flat(corners: Floats) -> Floats:
-    return np.column_stack([corners, np.zeros(len(corners))])
+    columns, rows = arguments.charuco
+    return Charuco(columns, rows, square, marker, arguments.dictionary)
 
 
 def _numbers(camera: CameraModel) -> dict[str, Any]:
@@ -239,7 +236,7 @@ def _numbers(camera: CameraModel) -> dict[str, Any]:
     }
 
 
-def _summary(result: LensCalibration, views: list[View]) -> dict[str, Any]:
+def _summary(result: LensCalibration) -> dict[str, Any]:
     return {
         "model": result.kind,
         **_numbers(result.camera),
@@ -250,8 +247,12 @@ def _summary(result: LensCalibration, views: list[View]) -> dict[str, Any]:
         "reach_px": result.reach_px,
         "share": result.share,
         "disagreement": result.disagreement,
+        "corners": sum(len(view.points) for view in result.views),
+        "corners_left_out": result.left_out,
+        "distances_m": list(result.distances),
         "board": None if result.bend is None else asdict(result.bend),
         "pictures": {
-            view.name: float(np.sqrt(np.mean(left**2))) for view, left in zip(views, result.residuals, strict=True)
+            view.name: float(np.sqrt(np.mean(left**2)))
+            for view, left in zip(result.views, result.residuals, strict=True)
         },
     }

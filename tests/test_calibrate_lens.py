@@ -13,11 +13,13 @@ from robotd.config import Calibration, load_calibration, save_calibration
 from robotd.errors import ConfigError, InputError, SolverError
 from robotd.geometry.camera import Camera
 from robotd.geometry.transforms import rotation_matrix
+from robotd.lens_tool import _read
 from robotd.records import CameraModel, Transform
+from robotd.solver.board_corners import agreeing
 from robotd.solver.board_shape import BoardShape
 from robotd.solver.calibrate_floor import Board
 from robotd.solver.calibrate_lens import Candidate, _choose, calibrate_lens
-from robotd.solver.lens_fit import View, camera_model, fit_lens, lens_jacobian, refine
+from robotd.solver.lens_fit import View, camera_model, fit_lens, lens_jacobian, pose_views, refine
 from robotd.solver.matlab_lens import load_matlab
 from robotd.solver_main import main
 from robotd.toml_edit import replace_element
@@ -253,12 +255,12 @@ def test_corners_that_leave_out_all_borders_a_little_are_refused_or_told():
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
-def drawn(texture, scale, R, t, seed=0):
-    """What a Brown-Conrady camera sees of a board, texture (H, W) with `scale` pixels per metre around its middle."""
-    rays, valid = rays_of_brown()
+def drawn(texture, scale, R, t, seed=0, kind="brown-conrady"):
+    """What a camera sees of a board, texture (H, W) with `scale` pixels per metre around its middle."""
+    rays, valid = rays_of(kind)
     R, t = R.astype(np.float32), t.astype(np.float32)
     normal = R[:, 2]
-    far = (normal @ t) / (rays @ normal)
+    far = (normal @ t) / np.where(np.abs(rays @ normal) < 1e-6, 1e-6, rays @ normal)
     on = (rays * far[:, None] - t) @ R[:, :2]
     at = on * np.float32(scale) + 0.5 * (np.array(texture.shape[::-1], np.float32) - 1.0)
     at[~valid | (far <= 0.0)] = -1e4
@@ -270,9 +272,9 @@ def drawn(texture, scale, R, t, seed=0):
 
 
 @cache
-def rays_of_brown():
+def rays_of(kind):
     v, u = np.mgrid[0:960, 0:1280]
-    camera = Camera(camera_model("brown-conrady", BROWN, SIZE))
+    camera = Camera(camera_model(kind, FISHEYE if kind == "fisheye" else BROWN, SIZE))
     rays, valid = camera.rays(np.column_stack([(u.ravel() + 0.5) / 2 - 0.5, (v.ravel() + 0.5) / 2 - 0.5]))
     return np.nan_to_num(rays, nan=1.0).astype(np.float32), valid
 
@@ -285,9 +287,12 @@ def chessboard_texture(scale=2000):
     return np.where(inside & ((i + j) % 2 == 0), 30, 215).astype(np.uint8)
 
 
-def charuco_texture():
-    board = cv2.aruco.CharucoBoard((10, 7), 0.03, 0.0225, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
-    return np.clip(board.generateImage((600, 420)), 30, 215).astype(np.uint8)
+def charuco_texture(columns=10, rows=7, marker=0.0225, dictionary="DICT_4X4_50", scale=2000, legacy=False):
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    board = cv2.aruco.CharucoBoard((columns, rows), 0.03, marker, known)
+    board.setLegacyPattern(legacy)
+    image = board.generateImage((round(0.03 * scale) * columns, round(0.03 * scale) * rows))
+    return np.clip(image, 30, 215).astype(np.uint8)
 
 
 @pytest.fixture(scope="module", params=["--board", "--charuco"])
@@ -379,6 +384,120 @@ def test_a_folder_of_the_robot_says_which_board_it_was(tmp_path, capsys):
     (tmp_path / "data.json").write_text("{}")
     assert main([*asked, "front"]) == 2
     assert "data.json: is not what" in capsys.readouterr().err
+
+
+# ---- small boards in wide lenses, other boards than asked for, odd files ---------------------------------------------
+
+
+@cache
+def small_boards():
+    """A board of 18 by 12 cm with fine markers, as boards were printed before OpenCV 4.6, in a lens of 180 degrees."""
+    texture, half = charuco_texture(6, 4, 0.019, "DICT_6X6_250", 4000, legacy=True), [0.09, 0.06, 0.0]
+    box = (np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 0]]) * half,)
+    scenes = poses("fisheye", FISHEYE, 12, seed=6, tilt=0.6, near=0.1, far=0.22, shapes=box)
+    return [drawn(texture, 4000.0, R, t, k, "fisheye") for k, (R, t, _) in enumerate(scenes)]
+
+
+def test_a_small_charuco_board_before_a_fisheye_is_found_and_the_lens_right(tmp_path):
+    for k, image in enumerate(small_boards()):
+        assert cv2.imwrite(str(tmp_path / f"{k:02d}.png"), image)
+    (tmp_path / "notes.txt").write_text("taken in the hall")
+    file = tmp_path / "calibration.toml"
+    asked = [
+        "--charuco",
+        "6x4",
+        "--square",
+        "0.03",
+        "--marker",
+        "0.019",
+        "--dictionary",
+        "DICT_6X6_250",
+        "--model",
+        "fisheye",
+    ]
+    asked.append("--partial")
+    assert main(["calibrate", "camera", str(tmp_path), *asked, "--camera", "front", "--calibration", str(file)]) == 0
+    found = load_calibration(file).camera("front")
+    assert found.model == "fisheye"
+    assert found.matrix == pytest.approx(FISHEYE[:4], abs=0.5)
+    v, u = np.mgrid[40:440:20, 100:540:20]
+    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
+    (a, _), (b, valid) = Camera(camera_model("fisheye", FISHEYE, SIZE)).rays(pixels), Camera(found).rays(pixels)
+    assert valid.mean() > 0.9
+    assert np.degrees(np.arccos(np.clip((a * b).sum(axis=1)[valid], -1.0, 1.0))).max() < 0.15
+
+
+def test_a_board_at_the_side_of_a_lens_of_more_than_half_a_circle_has_a_pose():
+    camera = Camera(camera_model("fisheye", FISHEYE, SIZE))
+    side = rotation_matrix([0.0, math.radians(86.0), 0.0])
+    X = POINTS[:, [1, 0, 2]] * 0.5 @ side.T + side[:, 2] * 0.3
+    behind = X[:, 2] < 0.0
+    assert 0 < behind.sum() < len(X)
+    board = View("side", POINTS[:, [1, 0, 2]] * 0.5, camera.project(X)[0])
+    start = fit_lens("fisheye", views("fisheye", FISHEYE, 8, noise=0.0), SIZE)
+    assert pose_views(start, [board], SIZE).cost < 1e-6
+
+
+def test_single_corners_in_the_wrong_place_are_left_out_and_counted():
+    scene = [View(v.name, v.points, v.pixels.copy()) for v in views("brown-conrady", BROWN, 12)]
+    for k, view in enumerate(scene[:5]):
+        view.pixels[7 * k] += [6.0, -4.0]
+    result = calibrate_lens(scene, SIZE, "front", ("brown-conrady",))
+    assert result.left_out == 5
+    assert result.rms_px == pytest.approx(0.1, rel=0.1)
+    assert (np.abs(np.array(result.camera.matrix) - BROWN[:4]) < 3.5 * result.sigmas).all()
+    assert calibrated("brown-conrady").left_out == 0
+
+
+def test_a_corner_that_its_neighbours_expect_elsewhere_does_not_agree():
+    pixels = POINTS[:, :2] @ np.array([[500.0, 80.0], [-60.0, 700.0]]) + [300.0, 200.0]
+    assert agreeing(POINTS, pixels, 0.03).all()
+    moved = pixels.copy()
+    moved[20] += [14.0, 0.0]
+    moved[21] -= [0.0, 16.0]
+    assert np.flatnonzero(~agreeing(POINTS, moved, 0.03)).tolist() == [20, 21]
+
+
+def hint(image, asked, tmp_path, capsys):
+    assert cv2.imwrite(str(tmp_path / "one.png"), image)
+    file = tmp_path / "calibration.toml"
+    rest = ["--square", "0.03", "--camera", "front", "--calibration", str(file)]
+    assert main(["calibrate", "camera", str(tmp_path), *asked, *rest]) == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("asked", ["9x5", "10x7", "8x5"])
+def test_a_chessboard_of_another_size_is_recognised(asked, tmp_path, capsys):
+    (R, t, _) = poses("brown-conrady", BROWN, 1, seed=4, tilt=0.3, near=0.3, far=0.4)[0]
+    assert "--board 9x6?" in hint(drawn(chessboard_texture(), 2000.0, R, t), ["--board", asked], tmp_path, capsys)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (["7x10"], "--charuco 10x7?"),
+        (["9x6"], "--charuco 10x7?"),
+        (["10x7", "--dictionary", "DICT_5X5_100"], "--dictionary DICT_4X4_50?"),
+    ],
+)
+def test_a_charuco_board_of_another_size_or_dictionary_is_recognised(asked, words, tmp_path, capsys):
+    (R, t, _) = poses("brown-conrady", BROWN, 1, seed=4, tilt=0.3, near=0.3, far=0.4)[0]
+    assert words in hint(drawn(charuco_texture(), 2000.0, R, t), ["--charuco", *asked], tmp_path, capsys)
+
+
+def test_pictures_of_twelve_bits_and_turned_ones_are_read_as_the_camera_delivered_them(tmp_path):
+    grey = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (48, 1))
+    assert cv2.imwrite(str(tmp_path / "deep.png"), grey.astype(np.uint16) * 16)
+    read = _read(tmp_path / "deep.png")
+    assert read.dtype == np.uint8
+    assert np.abs(read.astype(int) - grey * (255.0 / 252.0)).max() <= 1.0
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # orientation 6: a quarter
+    plain = cv2.imencode(".jpg", grey)[1].tobytes()
+    (tmp_path / "turned.jpg").write_bytes(
+        plain[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + plain[2:]
+    )
+    assert cv2.imread(str(tmp_path / "turned.jpg")).shape[:2] == (64, 48)
+    assert _read(tmp_path / "turned.jpg").shape == (48, 64)
 
 
 # ---- the file, MATLAB ------------------------------------------------------------------------------------------------

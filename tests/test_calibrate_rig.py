@@ -18,7 +18,7 @@ from robotd.solver.calibrate_rig import Bounds, calibrate_rig, camera_to_camera
 from robotd.solver.rig_report import report
 from robotd.solver.rig_start import merge, sphere
 from robotd.solver_main import main
-from tests.rig_course import CIRCLE, ROOF_BEACONS, STRAIGHT_ON, WORLD, rig_survey
+from tests.rig_course import CIRCLE, OUT_AND_BACK, ROOF_BEACONS, STRAIGHT_ON, WORLD, rig_survey
 from tests.store_surveys import load, with_sightings
 
 FAR_OFF = (np.radians(10.0), 0.05)
@@ -68,7 +68,7 @@ def test_known_labels_show_height_and_odometry_and_the_stated_uncertainties_hold
     assert result.floor_sigma == pytest.approx(np.radians(0.3) / np.sqrt(20.0), rel=1e-3)
     for name in ("roll", "pitch"):
         assert modes[name].survey == pytest.approx(result.floor_sigma, rel=0.05)
-    assert "20 stops show them to +- 0.067 degrees at best, 36 to 0.05" in report(result)
+    assert "20 stops show them to +- 0.067 degrees at best (the Cramer-Rao bound), 36 to 0.05" in report(result)
     assert result.scale.value == pytest.approx(factors[0], abs=4.0 * result.scale.sigma)
     assert result.turn.value == pytest.approx(factors[1], abs=4.0 * result.turn.sigma)
     for name, place in ROOF_BEACONS.items():
@@ -102,6 +102,44 @@ def test_the_rig_stays_where_it_was_measured_along_what_turns_on_the_spot_do_not
     assert "whole rig, yaw: not observable from this survey" in report(result)
     assert abs(hidden["height"].change) < 1e-4
     assert abs(hidden["yaw"].change) < np.radians(0.2)
+
+
+def test_a_rig_measured_amiss_as_a_whole_does_not_pull_along_what_the_survey_shows_much_better():
+    survey, _, _, _ = course(seed=2, known=30)
+    turn = rotation_matrix(
+        [np.radians(1.5), np.radians(-1.5), np.radians(1.5)]
+    )  # three sigma each, so no contradiction
+    turned = tuple(
+        replace(
+            camera,
+            T_robot_camera=replace(
+                camera.T_robot_camera,
+                rotation=tuple(rotation_vector(turn @ rotation_matrix(camera.T_robot_camera.rotation)).tolist()),
+            ),
+        )
+        for camera in survey.rig.cameras
+    )
+    right, amiss = (calibrate_rig(one) for one in (survey, replace(survey, rig=replace(survey.rig, cameras=turned))))
+    for a, b in zip(right.cameras, amiss.cameras, strict=True):
+        R = [rotation_matrix(one.model.T_robot_camera.rotation) for one in (a, b)]
+        assert np.degrees(np.abs(rotation_vector(R[0] @ R[1].T))).max() < 0.005
+    assert not any(mode.contradicts for mode in amiss.modes)
+
+
+def test_yaw_is_reported_with_the_bound_that_the_wheels_set():
+    survey, _, _, _ = course(seed=2, known=30, pattern=OUT_AND_BACK)
+
+    def rough(stop):
+        if stop.move is None:
+            return stop
+        covariance = tuple(map(tuple, (4.0 * np.array(stop.move.covariance)).tolist()))
+        return replace(stop, move=replace(stop.move, covariance=covariance))
+
+    yaw = calibrate_rig(survey).modes[-1]
+    result = calibrate_rig(replace(survey, stops=tuple(rough(stop) for stop in survey.stops)))
+    assert 1.6 * yaw.survey < result.modes[-1].survey < 2.0 * yaw.survey
+    words = report(result)
+    assert f"better than +- {np.degrees(result.modes[-1].survey):.3f} degrees (the Cramer-Rao bound)" in words
 
 
 def test_a_sphere_of_cameras_is_start_enough():

@@ -40,6 +40,9 @@ LEAST_SHARE = 0.5  # of the picture, in a circle around the lens's centre in whi
 FOLDS = 5
 LEAST_INFORMATION = 1e-6  # of all pictures', in a direction: what one picture tells less of is rounding
 HOPELESS = 25.0  # times the best squared error with a flat board: no shape of the board saves such a lens model
+STRAY = 6.0  # times the scatter of its picture, or of all if more: a corner that was found in the wrong place
+MOST_STRAY = 0.2  # of a picture's corners: more are no accident, and the picture itself is wrong
+ROUNDS = 4
 TINY = 1e-12  # square pixels: drawn pictures may have no error at all
 TIE = 0.02  # of the held-out squared error: less is not worth another model
 ORDER: tuple[LensKind, ...] = ("brown-conrady", "fisheye", "rational")  # on a tie the first one
@@ -89,8 +92,14 @@ class LensCalibration:
         Of fx, fy, cx, cy, in square pixels.
     reach_px : float
         Distance from the principal point up to which the lens was seen and is known to half a pixel.
+    views : tuple of View
+        The corners that were used.
+    left_out : int
+        Number of corners found in the wrong place.
     residuals : tuple of (N, 2) arrays, one per picture
         Fitted less seen corners, in pixels.
+    distances : (float, float)
+        From the camera to the middle of the nearest and of the farthest board, in metres.
     share : float
         Of the picture, within reach.
     bend : Bend or None
@@ -106,10 +115,13 @@ class LensCalibration:
     held_out_px: dict[str, float]
     covariance: Floats
     reach_px: float
+    views: tuple[View, ...]
+    left_out: int
     residuals: tuple[Floats, ...]
     share: float
     bend: Bend | None
     disagreement: float
+    distances: tuple[float, float]
 
     @property
     def held_out_words(self) -> str:
@@ -190,6 +202,7 @@ def calibrate_lens(
     flat = {kind: fit for kind in ORDER if kind in kinds and (fit := fit_lens(kind, views, size)) is not None}
     if not flat:
         raise SolverError("no lens model fits the corners; is the board flat, and are all pictures from one camera?")
+    given, (views, flat) = views, _without_strays(views, flat, size)
     board = BoardShape(np.concatenate([view.points for view in views]))
     fits = {Candidate(kind, False): fit for kind, fit in flat.items()}
     errors = {one: _held_out(fit, views, size, board) for one, fit in fits.items()}
@@ -211,7 +224,8 @@ def calibrate_lens(
         )
     covariance = _covariance(fit) * max(apart, 1.0) ** 2
     lens_covariance = covariance[: len(fit.lens), : len(fit.lens)]
-    missing = _flat(fit, views)
+    distances = _distances(fit, views)
+    missing = _flat(fit, distances)
     relative = float((np.sqrt(np.diag(lens_covariance))[:2] / fit.lens[:2]).max())
     if not relative <= MOST_SIGMA_FOCAL and not missing:
         missing = [
@@ -234,10 +248,13 @@ def calibrate_lens(
         {one.words: math.sqrt(float(np.mean(each))) for one, each in errors.items()},
         lens_covariance[:4, :4],
         reach,
+        tuple(views),
+        sum(len(view.points) for view in given) - sum(len(view.points) for view in views),
         tuple(np.split(fit.residuals, np.cumsum([len(view.points) for view in views])[:-1])),
         share,
         _bend(fit, covariance, board, views),
         apart,
+        (float(distances.min()), float(distances.max())),
     )
 
 
@@ -279,7 +296,13 @@ def _border(views: Sequence[View], size: tuple[int, int]) -> list[str]:
     ]
 
 
-def _flat(fit: LensFit, views: Sequence[View]) -> list[str]:
+def _distances(fit: LensFit, views: Sequence[View]) -> Floats:
+    """(P,) metres from the camera to the middle of each board."""
+    middles = [R @ view.points.mean(axis=0) + t for R, t, view in zip(fit.R, fit.t, views, strict=True)]
+    return np.asarray(np.linalg.norm(middles, axis=1))
+
+
+def _flat(fit: LensFit, distances: Floats) -> list[str]:
     missing = []
     normals = fit.R[:, :, 2]
     turn = float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)).max())
@@ -288,8 +311,6 @@ def _flat(fit: LensFit, views: Sequence[View]) -> list[str]:
             f"the boards are tilted by only {math.degrees(turn):.0f} degrees against each other, so the focal length"
             f" cannot be told from the distance; tilt them by 30 to 45 degrees, to all sides"
         )
-    middles = np.array([R @ view.points.mean(axis=0) + t for R, t, view in zip(fit.R, fit.t, views, strict=True)])
-    distances = np.linalg.norm(middles, axis=1)
     if distances.max() < LEAST_DEPTH * distances.min():
         missing.append(
             f"the boards are all at nearly the same distance ({distances.min():.2f} to {distances.max():.2f} m); hold"
@@ -309,6 +330,28 @@ def _consistent(fit: LensFit, views: Sequence[View]) -> None:
             f"the corners fit one lens only to {rms:.2f} px rms, worst {views[worst].name} with {each[worst]:.2f} px;"
             " leave it out if it is blurred or of another camera; otherwise, is the board flat and stiff?"
         )
+
+
+def _without_strays(
+    views: Sequence[View], fits: dict[LensKind, LensFit], size: tuple[int, int]
+) -> tuple[Sequence[View], dict[LensKind, LensFit]]:
+    """The views without single corners that were found in the wrong place, and the fits to what is left.
+
+    A corner goes if it is far off, by what most corners of its picture and of all pictures are, under the model that
+    fits best; a picture that is wrong as a whole is kept, to be named.
+    """
+    for _ in range(ROUNDS):
+        best = min(fits.values(), key=lambda fit: fit.cost)
+        ends = np.cumsum([len(view.points) for view in views])[:-1]
+        parts = [np.linalg.norm(part, axis=1) for part in np.split(best.residuals, ends)]
+        usual = float(np.median(np.concatenate(parts)))
+        kept = [part <= STRAY * max(float(np.median(part)), usual, TINY) for part in parts]
+        kept = [one if np.mean(one) >= 1.0 - MOST_STRAY else np.ones_like(one) for one in kept]
+        if all(one.all() for one in kept):
+            break
+        views = [View(view.name, view.points[one], view.pixels[one]) for view, one in zip(views, kept, strict=True)]
+        fits = {kind: refine(fit, views, size) for kind, fit in fits.items()}
+    return views, fits
 
 
 # ---- which model, how sure -------------------------------------------------------------------------------------------

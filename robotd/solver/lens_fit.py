@@ -7,6 +7,7 @@ what is applied later, rays at more than 90 degrees from the axis included. The 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -280,9 +281,13 @@ def _posed(kind: LensKind, lens: Floats, views: Sequence[View], size: tuple[int,
     camera = Camera(camera_model(kind, lens, size))
     pixels, ends = np.concatenate([v.pixels for v in views]), np.cumsum([len(v.points) for v in views])[:-1]
     rays, valid = camera.rays(pixels)
-    valid &= np.nan_to_num(rays[:, 2]) > 0.1  # a plane of normalised coordinates cannot hold the rest
     ways: tuple[list[tuple[Floats, Floats]], ...] = ([], [])
-    for view, ray, ok in zip(views, np.split(rays, ends), np.split(valid, ends), strict=True):
+    for view, ray, there in zip(views, np.split(rays, ends), np.split(valid, ends), strict=True):
+        if there.sum() < LEAST_POINTS:
+            return None
+        facing = _facing(ray[there].mean(axis=0))  # a board at the side of a fisheye is not before the camera's plane
+        ray = ray @ facing.T
+        ok = there & (np.nan_to_num(ray[:, 2]) > 0.1)
         if ok.sum() < LEAST_POINTS:
             return None
         plain = ray[ok, :2] / ray[ok, 2:]
@@ -293,7 +298,7 @@ def _posed(kind: LensKind, lens: Floats, views: Sequence[View], size: tuple[int,
             return None
         for way, k in zip(ways, (0, -1), strict=True):
             turn, shift = np.asarray(turns[k], np.float64).ravel(), np.asarray(shifts[k], np.float64).ravel()
-            way.append((rotation_matrix(turn), shift))
+            way.append((facing.T @ rotation_matrix(turn), facing.T @ shift))
     X = [view.points @ R.T + t for way in ways for view, (R, t) in zip(views, way, strict=True)]
     residuals = (camera.project(np.concatenate(X))[0].reshape(2, -1, 2) - pixels).transpose(1, 0, 2)
     parts = np.split(residuals, ends)
@@ -308,3 +313,12 @@ def _posed(kind: LensKind, lens: Floats, views: Sequence[View], size: tuple[int,
     nothing = np.zeros((len(views), 0))
     cost = float(costs.min(axis=1).sum())
     return LensFit(kind, lens, R, t, np.zeros(0), together, cost, nothing[:, :, None], nothing)
+
+
+def _facing(ray: Floats) -> Floats:
+    """The rotation that takes a ray to the axis z by the shortest way."""
+    axis = np.cross(ray, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        return np.eye(3)
+    return np.asarray(rotation_matrix(axis / sine * math.atan2(sine, float(ray[2]))))

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from .calibrate_lens import LensCalibration
 from .figure import ARROW, INK, MUTED, RING, new_figure, plain, save_figure
-from .lens_fit import View
 
 MAGNIFIED = 100.0  # times, the residuals over the view
 
 
-def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -> None:
+def draw_residuals(path: Path, result: LensCalibration) -> None:
     """Write a PNG.
 
     Raises
@@ -33,7 +31,7 @@ def draw_residuals(path: Path, result: LensCalibration, views: Sequence[View]) -
 
     width, height = result.camera.size
     centre = result.camera.matrix[2:]
-    seen, left = np.concatenate([view.pixels for view in views]), np.concatenate(result.residuals)
+    seen, left = np.concatenate([view.pixels for view in result.views]), np.concatenate(result.residuals)
     over = figure.add_axes((0.05, 0.08, 0.5, 0.73))
     arrows = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / MAGNIFIED, "color": ARROW}
     over.quiver(*seen.T, *left.T, width=0.0012, headwidth=3, **arrows)

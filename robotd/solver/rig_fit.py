@@ -23,6 +23,9 @@ COMMON = ("forward", "left", "height", "roll", "pitch", "yaw")  # metres, then r
 _MOST_COLUMNS = 6000  # of a dense inverse: 300 MB
 _SETTLED = 1e-4  # step of beacons and homographies in their standard deviations at which they are found
 _MOST_STEPS = 12
+_BETTER = (
+    3.0  # times: what a survey shows so much better than the tape it tells alone, as the tape would add 5 % at most
+)
 _CONTRADICTION = 4.0  # standard deviations between what a survey shows and where it was measured
 
 
@@ -240,7 +243,7 @@ def with_nominal(
     tape = np.repeat([common[1], common[0]], 3)
     survey = np.where(shown > 1e-3 / tape**2, 1.0 / np.sqrt(np.maximum(shown, 1e-30)), np.inf)
     wrong = (A @ offset) ** 2 > _CONTRADICTION**2 * (survey**2 + tape**2)
-    told = np.where(wrong, 1e3 * tape, tape)
+    told = np.where(wrong | (_BETTER * survey < tape), 1e3 * tape, tape)  # a tape read amiss would pull it along
     gain = P[:, :n] @ A.T @ np.linalg.inv(before + np.diag(told**2))
     step = -gain @ (A @ offset)
     P = P - gain @ A @ P[:n]

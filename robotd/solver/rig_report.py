@@ -44,9 +44,17 @@ def report(result: RigCalibration) -> str:
         stops = math.ceil((result.slope / _WANTED) ** 2)
         lines.append(
             f"roll and pitch rest on the floor, whose slope differs by {np.degrees(result.slope):.2f} degrees from "
-            f"stop to stop: {result.stops} stops show them to +- {np.degrees(result.floor_sigma):.3f} degrees at best, "
-            f"{stops} to {np.degrees(_WANTED):.2f} (better where it stood on each spot in opposite headings, as "
-            "robotctl calibrate rig drives: there the slope cancels)"
+            f"stop to stop: {result.stops} stops show them to +- {np.degrees(result.floor_sigma):.3f} degrees at best "
+            f"(the Cramer-Rao bound), {stops} to {np.degrees(_WANTED):.2f} (better where it stood on each spot in "
+            "opposite headings, as robotctl calibrate rig drives: there the slope cancels)"
+        )
+    yaw = result.modes[-1]
+    if yaw.is_shown and yaw.survey > _WANTED:
+        lines.append(
+            f"yaw shows only in how straight pieces are driven: with these wheels' noise no estimate from these moves "
+            f"is better than +- {np.degrees(yaw.survey):.3f} degrees (the Cramer-Rao bound); "
+            f"{math.ceil(result.stops * (yaw.survey / _WANTED) ** 2)} stops of this kind show it to "
+            f"{np.degrees(_WANTED):.2f}"
         )
     for name, (x, y, _) in result.beacons.items():
         lines.append(f"beacon {name}: x {x:.4f}, y {y:.4f} m, +- {1e3 * result.beacon_sigmas[name]:.1f} mm")

@@ -15,7 +15,7 @@ import pytest
 
 from robotd.geometry.transforms import rotation_matrix, rotation_vector
 from robotd.solver.calibrate_rig import CameraFit, calibrate_rig, camera_to_camera
-from robotd.solver.rig_fit import averaging, common_motions
+from robotd.solver.rig_fit import COMMON, averaging, common_motions
 from tests.rig_course import OUT_AND_BACK, rig_survey
 from tests.store_surveys import load
 
@@ -29,14 +29,16 @@ EQUAL = (1.0, 1.0)  # weights of radians and metres, where the common motion is 
 class Errors:
     """Of all cameras and seeds, in degrees and mm: on the robot, in the rig (less its common motion), between cameras.
 
-    `common` (seeds, 6) are the errors of the rig as a whole: forward, left, height, roll, pitch, yaw; `nees` the mean
-    squared error in the stated standard deviations of the rig's place, per value.
+    `common` (seeds, 6) are the errors of the rig as a whole: forward, left, height, roll, pitch, yaw; `bound` (6,) the
+    rms of their stated standard deviations, which are Cramer-Rao bounds if each stop has a slope of its own; `nees` the
+    mean squared error in them, per value.
     """
 
     robot: np.ndarray
     rig: np.ndarray
     pair: np.ndarray
     common: np.ndarray
+    bound: np.ndarray
     nees: float
 
 
@@ -57,7 +59,7 @@ def _norms(errors):
 def measure(name, known, seeds, **how):
     """Calibrate one survey a seed; prints a row."""
     store = load(name)
-    robot, rig, pair, common, square = [], [], [], [], []
+    robot, rig, pair, common, stated, square = [], [], [], [], [], []
     for seed in seeds:
         how = {"pattern": OUT_AND_BACK, "crosswise": True, "nominal": NOMINAL, "known": known, "sigma": SIGMA} | how
         survey, truth, _, _ = rig_survey(store, seed, **how)
@@ -68,7 +70,8 @@ def measure(name, known, seeds, **how):
         robot.append(_norms(errors))
         rig.append(_norms(rest))
         common.append(np.concatenate([1e3 * whole[:3], np.degrees(whole[3:])]))
-        sigma = np.array([[mode.sigma for mode in result.modes]])[0]
+        sigma = np.array([mode.sigma for mode in result.modes])
+        stated.append(np.concatenate([1e3 * sigma[:3], np.degrees(sigma[3:])]))
         square.append((whole / sigma) ** 2)
         for first in range(len(t)):
             order = [first, *(k for k in range(len(t)) if k != first)]
@@ -76,7 +79,8 @@ def measure(name, known, seeds, **how):
             true = camera_to_camera([truth[k].model for k in order])
             turn = rotation_vector(found[0] @ true[0].transpose(0, 2, 1))
             pair.append(_norms(np.column_stack([turn, found[1] - true[1]]))[1:])
-    found = Errors(*(np.concatenate(x) for x in (robot, rig, pair)), np.array(common), float(np.mean(square)))
+    bound = np.sqrt(np.mean(np.square(stated), axis=0))
+    found = Errors(*(np.concatenate(x) for x in (robot, rig, pair)), np.array(common), bound, float(np.mean(square)))
     rows = (("on the robot", found.robot), ("in the rig", found.rig), ("camera to camera", found.pair))
     text = "; ".join(
         f"{what} {np.sqrt((e[:, 0] ** 2).mean()):.3f} deg {np.sqrt((e[:, 1] ** 2).mean()):.2f} mm "
@@ -84,12 +88,13 @@ def measure(name, known, seeds, **how):
         for what, e in rows
     )
     print(f"{name:<10}{known:3d} known, {len(seeds)} seeds, rms: {text}", flush=True)
-    whole = np.sqrt((found.common**2).mean(axis=0))
+    whole = zip(COMMON, np.sqrt((found.common**2).mean(axis=0)), bound, strict=True)
     print(
-        "    rig as a whole, rms: "
-        + ", ".join(f"{what} {value:.2f} mm" for what, value in zip(("forward", "left", "height"), whole, strict=False))
-        + ", "
-        + ", ".join(f"{what} {v:.3f} deg" for what, v in zip(("roll", "pitch", "yaw"), whole[3:], strict=True))
+        "    rig as a whole, rms (bound): "
+        + ", ".join(
+            f"{what} {v:.3f} ({b:.3f}) deg" if what in COMMON[3:] else f"{what} {v:.2f} ({b:.2f}) mm"
+            for what, v, b in whole
+        )
         + f"; NEES {found.nees:.2f}",
         flush=True,
     )
