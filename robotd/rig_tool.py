@@ -184,7 +184,7 @@ def _inputs(arguments: argparse.Namespace) -> tuple[Survey, Calibration]:
 
 
 def _tell(arguments: argparse.Namespace, result: RigCalibration, before: Calibration) -> int:
-    words = report(result)
+    words = report(result, arguments.what)
     if arguments.report is not None:
         write_atomic(arguments.report, words.encode())
     print(json.dumps(_summary(result)) if arguments.json else words, end="\n" if arguments.json else "")

@@ -128,7 +128,12 @@ class LensCalibration:
         """The held-out errors of every model tried."""
         flat, bends = (
             ", ".join(
-                f"{one} {self.held_out_px[word]:.3f}"
+                f"{one} "
+                + (
+                    f"{self.held_out_px[word]:.3f}"
+                    if self.held_out_px[word] < np.inf
+                    else "(not valid at some corners)"
+                )
                 for one in ORDER
                 if (word := Candidate(one, bend).words) in self.held_out_px
             )

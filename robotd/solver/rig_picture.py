@@ -65,11 +65,11 @@ def _draw_view(place: object, camera: CameraFit) -> None:
     arrows = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / MAGNIFIED, "color": ARROW}
     place.quiver(*camera.seen[some].T, *camera.left[some].T, width=0.003, headwidth=3, **arrows)
     place.plot(*camera.seen[some].T, ".", color=MUTED, markersize=2)
-    place.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    place.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="u (px)", ylabel="v (px)")
     turn, shift = camera.rig_sigma
     place.set_title(
-        f"{plain(camera.model.name)}: {camera.rms_px:.2f} px rms (x {MAGNIFIED:.0f}); +- {np.degrees(turn):.3f} deg,"
-        f" {1e3 * shift:.2f} mm",
+        f"{plain(camera.model.name)}: residuals x {MAGNIFIED:.0f}, {camera.rms_px:.2f} px rms\n"
+        f"in the rig +- {np.degrees(turn):.3f} degrees, {1e3 * shift:.2f} mm",
         size=9.5,
         color=INK,
     )

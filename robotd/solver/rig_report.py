@@ -12,13 +12,31 @@ from .rig_fit import amount
 _WANTED = np.radians(0.05)
 
 
-def report(result: RigCalibration) -> str:
-    """The calibration for a reader, one statement a line."""
+def report(result: RigCalibration, what: str = "rig") -> str:
+    """The calibration for a reader, one statement a line.
+
+    Parameters
+    ----------
+    result : RigCalibration
+    what : str
+        rig (all of it), odometry or beacons.
+    """
     sightings = sum(len(camera.seen) for camera in result.cameras)
     lines = [
         f"{result.stops} stops, {result.known} known labels, {sightings} sightings used "
         f"({100 * result.explained:.0f} % of what several stops saw)"
     ]
+    if what == "rig":
+        lines += _rig(result)
+    if what != "odometry":
+        lines += _beacons(result)
+    if what != "beacons":
+        lines += _odometry(result)
+    return "\n".join([*lines, *(f"note: {note}" for note in result.notes)]) + "\n"
+
+
+def _rig(result: RigCalibration) -> list[str]:
+    lines = []
     for camera in result.cameras:
         turn, place = camera.rig_sigma
         wide, far = camera.robot_sigma
@@ -56,6 +74,11 @@ def report(result: RigCalibration) -> str:
             f"{math.ceil(result.stops * (yaw.survey / _WANTED) ** 2)} stops of this kind show it to "
             f"{np.degrees(_WANTED):.2f}"
         )
+    return lines
+
+
+def _beacons(result: RigCalibration) -> list[str]:
+    lines = []
     for name, (x, y, _) in result.beacons.items():
         lines.append(f"beacon {name}: x {x:.4f}, y {y:.4f} m, +- {1e3 * result.beacon_sigmas[name]:.1f} mm")
     if result.beacon_distance is not None:
@@ -65,10 +88,15 @@ def report(result: RigCalibration) -> str:
         f"roof camera {roof.name}: homography moved by {1e3 * roof.moved:.1f} mm, +- {1e3 * roof.sigma:.1f} mm"
         for roof in result.roofs
     ]
+    return lines
+
+
+def _odometry(result: RigCalibration) -> list[str]:
+    lines = []
     for what, factor in (("distances", result.scale), ("turns", result.turn)):
         if factor.value is None:
             why = "measure two labels or use roof cameras" if what == "distances" else "make more turns"
             lines.append(f"odometry's {what}: not observable from this survey; {why}")
         else:
             lines.append(f"odometry's {what} must be multiplied by {factor.value:.5f} +- {factor.sigma:.5f}")
-    return "\n".join([*lines, *(f"note: {note}" for note in result.notes)]) + "\n"
+    return lines
