@@ -9,13 +9,19 @@ from __future__ import annotations
 import numpy as np
 
 from ..records import Floats
-from .problem import Problem
+from .problem import Bools, Known, Problem
 from .wheel_errors import SLIPPED
 
 _SLIPPING = 0.25  # of the moves, and two, from which known labels are doubted
+_WRONG = 5.0  # standard deviations
 _SAME_M = 0.05  # rms to which two sets of positions are the same
 _ANOTHER_SIZE = 0.02
 _ON_A_LINE_M = 0.3  # aside of the line through the known labels
+
+
+def chosen(known: Known, keep: Bools) -> Known:
+    """Some of the known labels."""
+    return Known(known.label[keep], known.position[keep], known.sigma[keep])
 
 
 def slipped(problem: Problem) -> int:
@@ -36,6 +42,15 @@ def contradicted(asked: Problem, found: Problem, points: Floats) -> bool:
     seen = np.isin(asked.known.label, found.sightings.label)
     given, here = asked.known.position[seen], points[asked.known.label[seen]]
     return dropped > 0 and left <= 2 and difference(given, here) != ""
+
+
+def undecided(asked: Problem, points: Floats) -> bool:
+    """Whether so few known labels agree with the points (L, 3) found that which of them is wrong is open."""
+    known = asked.known
+    seen = np.isin(known.label, asked.sightings.label)
+    wrong = np.linalg.norm(points[known.label] - known.position, axis=1) > np.maximum(_WRONG * known.sigma, _SAME_M)
+    count = int(np.count_nonzero(wrong & seen))
+    return bool(asked.frame == "known labels" and count > 0 and np.count_nonzero(seen) - count <= 2)
 
 
 def difference(given: Floats, found: Floats) -> str:

@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from scipy.special import gammaincc
 
 from ..errors import InputError
-from .covariance import frame_covariance
 from .known_labels import slipped
-from .problem import CAMERA, ODOMETRY, SIGMA_FLOOR_PX, STOP, Problem, build_problem, stops_per_label
+from .problem import CAMERA, ODOMETRY, SIGMA_FLOOR_PX, Problem, build_problem, stops_per_label
 from .readings import CAMERAS, LENSES, NEARLY, Reading, lengths, lenses, nearly, rigs, signs
+from .references import IMPOSSIBLE, MOST_TO_TRY, POSSIBLE, chance
 from .robust import Optimum, optimise
 
 FITS = 0.5  # share of the survey's sightings below which its calibration or its units are doubted
@@ -31,13 +30,10 @@ _LEAST_LIGHTS = 20  # to say so
 _CLEARLY_BETTER = 0.25  # of that share, to blame two cameras or anything else
 _RATHER_BETTER = 0.15  # to blame moves, if then nearly all fit
 _NEARLY_ALL = 0.9
-_MOST_TO_TRY = 5000  # sightings
 _SCATTERS, _SCATTERS_NOT = 1.8, 1.4  # times their stated standard deviations, or those of what lenses leave
 _NO_LENS = 4.0  # times that, where many sightings do not fit at all
 _SLIPPING = 0.25  # of the moves, and two: wheels slip once in twenty metres
 _MOSTLY_SLIPPED, _MANY_SLIPPED = 0.8, 3  # of the moves from which nothing is placed
-_IMPOSSIBLE, _POSSIBLE = 1e-8, 1e-4  # probabilities of how far the calibration is from its priors
-_TOLD = 0.02  # share of a prior's variance from which the survey tells about it
 _SUNKEN_M = 0.05  # below the floor, that slopes and steps explain
 _MANY_SUNKEN, _SUNKEN_SHARE = 3, 0.15  # labels, and of all labels, from which heights are doubted
 _STRAINED = 4.0  # standard deviations, of one value; of a root mean square over a rig half of it
@@ -80,7 +76,7 @@ class Strain:
     @property
     def is_there(self) -> bool:
         """Whether the survey is doubtful."""
-        return self.share < _UNSURE or self.scatters or self.slips or self.chance < _IMPOSSIBLE
+        return self.share < _UNSURE or self.scatters or self.slips or self.chance < IMPOSSIBLE
 
     def is_relieved(self, other: Strain) -> bool:
         """Whether another reading of the survey has none of this strain."""
@@ -89,8 +85,8 @@ class Strain:
         return (
             (not self.scatters or other.scatter < _SCATTERS_NOT)
             and (not self.slips or not other.slips)
-            and (self.chance >= _IMPOSSIBLE or other.chance > _POSSIBLE)
-            and (self.scatters or self.slips or self.chance < _IMPOSSIBLE)
+            and (self.chance >= IMPOSSIBLE or other.chance > POSSIBLE)
+            and (self.scatters or self.slips or self.chance < IMPOSSIBLE)
             and other.share > min(_UNSURE, self.share + _RATHER_BETTER)
         )
 
@@ -101,14 +97,20 @@ def strain(optimum: Optimum) -> Strain:
     s, moves = problem.sightings, problem.moves
     stated = np.maximum(problem.columns.sigma[s.source], SIGMA_FLOOR_PX)
     scatter = float(np.median(s.sigma / stated)) if len(s) else 1.0
-    return Strain(explained_share(optimum), scatter, slipped(problem), len(moves.before), _chance(optimum))
+    return Strain(
+        explained_share(optimum),
+        scatter,
+        slipped(problem),
+        len(moves.before),
+        chance(optimum.adjustment, optimum.state),
+    )
 
 
 def misfit(asked: Problem, optimum: Optimum) -> Misfit:
     """Judge how much of a survey its optimum explains, and look for the mistake if that is little."""
     seen = strain(optimum)
     little = f"only {100 * seen.share:.0f} % of the sightings fit any map, so few labels are placed"
-    if seen.is_there and len(asked.sightings) <= _MOST_TO_TRY:
+    if seen.is_there and len(asked.sightings) <= MOST_TO_TRY:
         found = _best_reading(asked, seen)
         if found is not None:
             reading, said, other = found
@@ -176,7 +178,7 @@ def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
         for reading in chain(signs(survey), rigs(survey)):
             if reading.kind != CAMERAS or seen.share < _MOSTLY:  # exchanged cameras leave no survey that fits
                 yield reading
-    if not seen.scatters and (everything or seen.chance < _IMPOSSIBLE):
+    if not seen.scatters and (everything or seen.chance < IMPOSSIBLE):
         yield from lenses(survey)
 
 
@@ -184,30 +186,9 @@ def _complaints(seen: Strain) -> str:
     said = []
     if seen.slips:
         said.append(f"{seen.slipped} of {seen.moves} moves are not what cameras saw")
-    if seen.chance < _IMPOSSIBLE:
+    if seen.chance < IMPOSSIBLE:
         said.append("rig, lenses and wheels would all have to be far off their calibration")
     return "; ".join(said) or "sightings scatter too much"
-
-
-def _chance(optimum: Optimum) -> float:
-    """Probability that the calibration is as far from its priors as the optimum has it; 1 where nothing tells.
-
-    What is estimated of a quantity scatters about its prior by the prior's variance less the one that is left.
-    """
-    problem = optimum.problem
-    entries = np.arange(STOP * problem.stop_count, len(problem.prior_sigma))
-    prior = problem.prior_sigma[entries]
-    entries, prior = entries[prior > 0.0], prior[prior > 0.0]
-    if len(entries) == 0 or len(problem.sightings) > _MOST_TO_TRY:
-        return 1.0
-    left = frame_covariance(optimum.adjustment, optimum.state)
-    if left is None:
-        return 1.0
-    spread = np.eye(len(entries)) - left[np.ix_(entries, entries)] / np.outer(prior, prior)
-    values, vectors = np.linalg.eigh(spread)
-    told = values > _TOLD
-    size = float(((vectors.T @ (optimum.state.frame[entries] / prior))[told] ** 2 / values[told]).sum())
-    return float(gammaincc(0.5 * np.count_nonzero(told), 0.5 * size)) if told.any() and np.isfinite(size) else 1.0
 
 
 def is_below_floor(z: float, variance: float) -> bool:

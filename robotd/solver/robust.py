@@ -19,9 +19,10 @@ from .bundle import SQUARE, Adjustment, Loss, Solution
 from .covariance import Covariance, covariance
 from .hypotheses import Hypotheses, behind_glass, hypotheses, in_floor, out_of_glass, support, with_shared
 from .initial import epipolar_moves
-from .known_labels import contradicted, difference, slipped
+from .known_labels import contradicted, difference, slipped, undecided
 from .placement import Placement, at_first_stop, detach, place, ray_tolerance, retriangulate
 from .problem import Bools, Problem, State, stops_per_label
+from .references import IMPOSSIBLE, POSSIBLE, agreeing, beacons_disagree, bends, chance
 from .tie_sightings import without_ties
 from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
@@ -95,19 +96,38 @@ def optimise(
     if not thorough:
         return _from_starts(problem, start, grown, thorough)
     optimum = _optimise(problem, start, grown)
-    if not contradicted(problem, optimum.problem, optimum.state.points):
+    if problem.frame == "first stop":
+        return optimum
+    impossible = chance(optimum.adjustment, optimum.state) < IMPOSSIBLE
+    beacons = optimum.adjustment.residuals(optimum.state, SQUARE).roof
+    some = undecided(problem, optimum.state.points) or beacons_disagree(problem, beacons)
+    if not (some or impossible or contradicted(problem, optimum.problem, optimum.state.points)):
         return optimum
     # without them, where that takes the contradictions away
-    other = _optimise(at_first_stop(problem, ""), start, grown)
+    other = _optimise(at_first_stop(problem, ""), start, None)
+    if np.count_nonzero(other.inlier) < 0.98 * np.count_nonzero(optimum.inlier):
+        return optimum
+    both = np.intersect1d(optimum.adjustment.labels, other.adjustment.labels)
+    impossible &= len(both) > 0 and bends(optimum.state.points[both], other.state.points[both])
+    impossible &= chance(other.adjustment, other.state) > POSSIBLE
     kept = np.isin(problem.known.label, other.adjustment.labels)
     how = difference(problem.known.position[kept], other.state.points[problem.known.label[kept]])
     fewer = slipped(optimum.problem) - slipped(other.problem)
-    if fewer < (0 if how else 2) or other.inlier.sum() < 0.98 * optimum.inlier.sum():
-        return optimum
+    whole = contradicted(problem, optimum.problem, optimum.state.points) and fewer >= (0 if how else 2)
+    if not whole:
+        if fewer < 0 or not (some or impossible):
+            return optimum
+        agreed = agreeing(problem, other.state, other.covariance, other.adjustment.labels, other.placed)
+        if agreed is problem and not (impossible or undecided(problem, optimum.state.points)):
+            return optimum
+        if agreed is not None and agreed is not problem:
+            better = _optimise(agreed, start, None)
+            if not impossible or chance(better.adjustment, better.state) > POSSIBLE:
+                return better
     note = (
-        "the known labels contradict the sightings and the moves, so the first stop fixes the world frame; "
+        f"the {problem.frame} contradict the sightings and the moves, so the first stop fixes the world frame; "
         + (f"they would fit {how}; " if how else "")
-        + "check their positions and names"
+        + ("check their positions and names" if problem.frame == "known labels" else "check their homographies")
     )
     notes = (note, *(text for text in other.problem.notes if text))
     return replace(other, problem=replace(other.problem, notes=notes))

@@ -8,6 +8,7 @@ import numpy as np
 
 from .breaks import lost_note, without_moves
 from .bundle import SQUARE, Adjustment
+from .known_labels import chosen
 from .problem import Ints, Problem, State, anchors
 from .wheel_errors import LOST, SLIPPED, slip_covariance
 
@@ -72,7 +73,7 @@ def without_known(problem: Problem, state: State, wrong: Ints) -> Problem:
             continue
         said = f"{named} {miss:.0f} mm from where the sightings put it"
         keep = np.arange(len(known.label)) != k
-        rest = replace(known, label=known.label[keep], position=known.position[keep], sigma=known.sigma[keep])
+        rest = chosen(known, keep)
         if problem.frame == "known labels" and not anchors(rest, problem.sightings):
             note = f"{said}, but too few others fix the world frame; measure a third label"
             problem = replace(problem, notes=(*problem.notes, note))
