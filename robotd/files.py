@@ -27,7 +27,7 @@ from .bind import bind
 from .errors import ConfigError, InputError
 from .plan_records import Plan
 from .records import Map, Stop, Survey, Vector3
-from .survey_checks import Problems, check_header, check_map, check_stop, check_stops
+from .survey_checks import FARTHEST_M, Problems, check_header, check_map, check_stop, check_stops
 from .typed_json import decode, repeated_keys, with_infinite
 
 R = TypeVar("R")
@@ -376,10 +376,10 @@ def load_points(path: str | Path) -> Points:
     try:
         rows = [(number, row) for number, row in _rows(text) if any(cell.strip() for cell in row)]
     except csv.Error as error:
-        raise InputError(f"{path}: not a table: {error}") from error
+        raise InputError(f"{path}: not a table: {error}; expected one label a line") from error
     header = [cell.strip() for cell in rows[0][1]] if rows else []
     if sorted(header) not in (["label", "x", "y", "z"], ["label", "sigma", "x", "y", "z"]):
-        found = ",".join(header)[:80] or "nothing"
+        found = repr(",".join(header)[:80]) if header else "nothing"
         raise InputError(f"{path} line 1: found {found}; expected the header label,x,y,z or label,x,y,z,sigma")
     points: Points = {}
     first: dict[str, int] = {}
@@ -394,7 +394,7 @@ def load_points(path: str | Path) -> Points:
         if not label:
             problems.append(f"{where} label: found nothing; expected the label's id")
         if label in first:
-            problems.append(f"{where} label: '{label}' is on line {first[label]} already; keep one")
+            problems.append(f"{where} label: {label[:60]!r} is on line {first[label]} already; keep one")
         first.setdefault(label, number)
         values = {name: _number(cell, f"{where} {name}", problems) for name, cell in cells.items() if name != "sigma"}
         sigma = _number(cells["sigma"], f"{where} sigma", problems) if cells.get("sigma") else None
@@ -417,8 +417,8 @@ def _number(cell: str, where: str, problems: list[str]) -> float:
         value = float(cell)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        problems.append(f"{where}: found {cell[:40]!r}; expected a finite number in metres")
+    if not abs(value) <= FARTHEST_M:
+        problems.append(f"{where}: found {cell[:40]!r}; expected a finite number in metres, up to {FARTHEST_M:g}")
     return value
 
 

@@ -101,9 +101,13 @@ def load_line(path: Path) -> Floats:
         rows = list(csv.reader(read_bytes(path).decode("utf-8-sig").splitlines()))
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 at byte {error.start}; save the table as UTF-8") from error
+    except csv.Error as error:
+        raise InputError(f"{path}: not a table: {error}; expected the header x,y and two numbers a line") from error
     if not rows or [cell.strip() for cell in rows[0]] != ["x", "y"]:
         raise InputError(
-            f"{path} line 1: found {','.join(rows[0])[:40] if rows else 'nothing'}; expected the header x,y"
+            f"{path} line 1: found {','.join(rows[0])[:40]!r}; expected the header x,y"
+            if rows
+            else f"{path} line 1: found nothing; expected the header x,y"
         )
     points, problems = [], []
     for number, row in enumerate(rows[1:], start=2):

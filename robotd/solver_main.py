@@ -276,12 +276,12 @@ def _summarise(result: Map) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from .config import collect
-    from .files import load_map, load_points
+    from .files import load_points
     from .solver import evaluate
     from .solver.evaluate import text_table
 
     problems: list[str] = []
-    results = [collect(problems, partial(load_map, path)) for path in arguments.maps]
+    results = [collect(problems, partial(_load_positions, path)) for path in arguments.maps]
     points = collect(problems, lambda: load_points(arguments.truth))
     if problems or points is None:
         raise InputError(*problems)
@@ -304,6 +304,18 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     else:
         print(text_table(evaluations))
     return 0
+
+
+def _load_positions(path: Path) -> Map:
+    """A map whose positions can be computed with."""
+    from .files import load_map
+    from .survey_checks import Problems, check_positions
+
+    result = load_map(path)
+    problems = Problems(str(path))
+    check_positions(result, problems)
+    problems.raise_if_any()
+    return result
 
 
 def _check(arguments: argparse.Namespace) -> int:

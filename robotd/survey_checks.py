@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from . import sighting_columns
 from .bind import describe
 from .errors import InputError
-from .records import CameraModel, MappedLabel, Matrix3, Rig, RoofCamera, Stop, Survey
+from .records import CameraModel, Map, MappedLabel, Matrix3, Rig, RoofCamera, Stop, Survey
 
 T = TypeVar("T")
 
@@ -27,6 +27,7 @@ FARTHEST_LABEL_M = 2000.0
 HIGHEST_LABEL_M = 50.0
 LONGEST_MOVE_M = 500.0
 WIDEST_PRIOR = {"tilt_rad": 0.5, "camera_rotation_rad": 1.0, "camera_translation_m": 2.0, "beacon_m": 1.0}
+FARTHEST_M = 1e8  # of any coordinate: maps of countries are smaller, and its square is a number still
 FULL_TURN = 2.0 * np.pi + 1e-9
 METRES, RADIANS = "metres; are these millimetres?", "radians; are these degrees?"
 SHORTEST_FOCAL = 0.02  # of the image's width: wider than any lens
@@ -134,6 +135,13 @@ def check_units(survey: Survey, problems: Problems) -> None:
             if stop.move.by_errors is not None:
                 largest = max(abs(value) for row in stop.move.by_errors for value in row)
                 _within(largest, LONGEST_MOVE_M, f"{path}.by_errors", METRES, problems)
+
+
+def check_positions(result: Map, problems: Problems) -> None:
+    """Name positions too far away to compute with; the file may hold any number."""
+    for index, label in enumerate(result.labels):
+        for axis, value in enumerate(label.position or ()):
+            _within(abs(value), FARTHEST_M, f"labels[{index}].position[{axis}]", METRES, problems)
 
 
 def _within(value: float, most: float, path: str, unit: str, problems: Problems) -> None:
