@@ -71,12 +71,10 @@ class Chessboard:
 
     def explain(self, images: Sequence[Bytes]) -> str:
         """The largest board that several pictures show; see `Finder`."""
-        sizes: Counter[tuple[int, int]] = Counter()
-        for image in images[: 2 * _TRIED]:
-            done, _, meta = cv2.findChessboardCornersSBWithMeta(image, SMALLEST, cv2.CALIB_CB_LARGER)
-            if done and meta is not None:
-                rows, columns = np.shape(meta)[:2]
-                sizes[max(columns, rows), min(columns, rows)] += 1
+        name, count = _other_dictionary(images[:2])
+        if count >= LEAST_MARKERS:
+            return f"others show a ChArUco board, with {count} markers of {name}: --charuco, --dictionary {name}?"
+        sizes = _chessboards(images[: 2 * _TRIED])
         asked = (max(self.board.columns, self.board.rows), min(self.board.columns, self.board.rows))
         tried = min(len(images), 2 * _TRIED)
         # what is smaller is a part of the board, unless most pictures show the same
@@ -152,6 +150,10 @@ class Charuco:
             name, count = _other_dictionary(images[:2])
             if count >= LEAST_MARKERS:
                 return f"others show no markers of {self.dictionary}, but {count} of {name}: --dictionary {name}?"
+            sizes = _chessboards(images[:_TRIED])
+            if sizes:
+                (columns, rows), _ = sizes.most_common(1)[0]
+                return f"others show a chessboard without markers, {columns}x{rows} inner corners: --board?"
             return (
                 f"others show no markers of {self.dictionary}; is the board near, sharp, lit, and --dictionary right?"
             )
@@ -227,6 +229,17 @@ def _off(points: Floats, pixels: Floats, k: int, around: NDArray[np.bool_], squa
         return 0.0
     seen = square * float(np.linalg.svd(affine[:2], compute_uv=False)[-1])
     return float(np.linalg.norm(affine[2] - pixels[k])) / max(seen, 1e-9)
+
+
+def _chessboards(images: Sequence[Bytes]) -> Counter[tuple[int, int]]:
+    """How many pictures show how many inner corners along the longer and the shorter side of what is seen."""
+    sizes: Counter[tuple[int, int]] = Counter()
+    for image in images:
+        done, _, meta = cv2.findChessboardCornersSBWithMeta(image, SMALLEST, cv2.CALIB_CB_LARGER)
+        if done and meta is not None:
+            rows, columns = np.shape(meta)[:2]
+            sizes[max(columns, rows), min(columns, rows)] += 1
+    return sizes
 
 
 def _enlarged(image: Bytes, scale: float) -> Bytes:

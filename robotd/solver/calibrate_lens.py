@@ -20,7 +20,19 @@ from ..geometry.camera import Camera
 from ..geometry.transforms import skew
 from ..records import CameraModel, Floats
 from .board_shape import BoardShape
-from .lens_fit import LensFit, LensKind, View, bent, camera_model, fit_lens, lens_jacobian, pose_views, refine, without
+from .lens_fit import (
+    LensFit,
+    LensKind,
+    View,
+    bent,
+    camera_model,
+    fit_lens,
+    lens_jacobian,
+    pose_views,
+    refine,
+    without,
+    without_strays,
+)
 
 LEAST_VIEWS = 8  # different pictures: Zhang (PAMI 22(11), 2000) needs 3, and held-out pictures must stay out
 LEAST_MOVE = 0.01  # of the picture's width, by which corners must differ between different pictures
@@ -40,9 +52,6 @@ LEAST_SHARE = 0.5  # of the picture, in a circle around the lens's centre in whi
 FOLDS = 5
 LEAST_INFORMATION = 1e-6  # of all pictures', in a direction: what one picture tells less of is rounding
 HOPELESS = 25.0  # times the best squared error with a flat board: no shape of the board saves such a lens model
-STRAY = 6.0  # times the scatter of its picture, or of all if more: a corner that was found in the wrong place
-MOST_STRAY = 0.2  # of a picture's corners: more are no accident, and the picture itself is wrong
-ROUNDS = 4
 TINY = 1e-12  # square pixels: drawn pictures may have no error at all
 TIE = 0.02  # of the held-out squared error: less is not worth another model
 ORDER: tuple[LensKind, ...] = ("brown-conrady", "fisheye", "rational")  # on a tie the first one
@@ -207,7 +216,7 @@ def calibrate_lens(
     flat = {kind: fit for kind in ORDER if kind in kinds and (fit := fit_lens(kind, views, size)) is not None}
     if not flat:
         raise SolverError("no lens model fits the corners; is the board flat, and are all pictures from one camera?")
-    given, (views, flat) = views, _without_strays(views, flat, size)
+    given, (views, flat) = views, without_strays(views, flat, size)
     board = BoardShape(np.concatenate([view.points for view in views]))
     fits = {Candidate(kind, False): fit for kind, fit in flat.items()}
     errors = {one: _held_out(fit, views, size, board) for one, fit in fits.items()}
@@ -272,19 +281,22 @@ def _refusal(missing: Sequence[str]) -> str:
 
 def _too_few(views: Sequence[View], size: tuple[int, int]) -> list[str]:
     """A board that stayed where it was tells nothing new."""
-    different: list[View] = []
+    different: list[dict[tuple[float, ...], Floats]] = []
     for view in views:
-        if not any(
-            one.pixels.shape == view.pixels.shape
-            and np.abs(one.pixels - view.pixels).max() < LEAST_MOVE * size[0]
-            and np.array_equal(one.points, view.points)
-            for one in different
-        ):
-            different.append(view)
+        seen = dict(zip(map(tuple, view.points.tolist()), view.pixels, strict=True))
+        if not any(_same(seen, one, LEAST_MOVE * size[0]) for one in different):
+            different.append(seen)
     if len(different) >= LEAST_VIEWS:
         return []
     again = f" ({len(views)}, but in some the board did not move)" if len(different) < len(views) else ""
-    return [f"{len(different)} different pictures{again}; take {LEAST_VIEWS} or more, 20 are better"]
+    pictures = "picture" if len(different) == 1 else "pictures"
+    return [f"{len(different)} different {pictures}{again}; take {LEAST_VIEWS} or more, 20 are better"]
+
+
+def _same(a: dict[tuple[float, ...], Floats], b: dict[tuple[float, ...], Floats], most: float) -> bool:
+    """Whether the corners that two pictures share, half of them or more, are within so many pixels of each other."""
+    both = a.keys() & b.keys()
+    return 2 * len(both) >= max(len(a), len(b)) and all(np.abs(a[one] - b[one]).max() < most for one in both)
 
 
 def _border(views: Sequence[View], size: tuple[int, int]) -> list[str]:
@@ -335,28 +347,6 @@ def _consistent(fit: LensFit, views: Sequence[View]) -> None:
             f"the corners fit one lens only to {rms:.2f} px rms, worst {views[worst].name} with {each[worst]:.2f} px;"
             " leave it out if it is blurred or of another camera; otherwise, is the board flat and stiff?"
         )
-
-
-def _without_strays(
-    views: Sequence[View], fits: dict[LensKind, LensFit], size: tuple[int, int]
-) -> tuple[Sequence[View], dict[LensKind, LensFit]]:
-    """The views without single corners that were found in the wrong place, and the fits to what is left.
-
-    A corner goes if it is far off, by what most corners of its picture and of all pictures are, under the model that
-    fits best; a picture that is wrong as a whole is kept, to be named.
-    """
-    for _ in range(ROUNDS):
-        best = min(fits.values(), key=lambda fit: fit.cost)
-        ends = np.cumsum([len(view.points) for view in views])[:-1]
-        parts = [np.linalg.norm(part, axis=1) for part in np.split(best.residuals, ends)]
-        usual = float(np.median(np.concatenate(parts)))
-        kept = [part <= STRAY * max(float(np.median(part)), usual, TINY) for part in parts]
-        kept = [one if np.mean(one) >= 1.0 - MOST_STRAY else np.ones_like(one) for one in kept]
-        if all(one.all() for one in kept):
-            break
-        views = [View(view.name, view.points[one], view.pixels[one]) for view, one in zip(views, kept, strict=True)]
-        fits = {kind: refine(fit, views, size) for kind, fit in fits.items()}
-    return views, fits
 
 
 # ---- which model, how sure -------------------------------------------------------------------------------------------

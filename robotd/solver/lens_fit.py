@@ -27,6 +27,10 @@ LEAST_POINTS = 6  # of a board, from which its pose is started
 STEPS = 50
 SETTLED = 1e-7  # relative fall of the cost at which a fit ends
 MOST_DAMPING = 1e6
+STRAY = 6.0  # times the scatter of its picture, or of all if more: a corner that was found in the wrong place
+MOST_STRAY = 0.2  # of a picture's corners: more are no accident, and the picture itself is wrong
+ROUNDS = 4
+EXACT = 1e-9  # px: drawn pictures may have no error at all
 NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
@@ -167,6 +171,28 @@ def pose_views(
 def without(fit: LensFit, keep: Sequence[int]) -> LensFit:
     """The fit as the start for some of its pictures."""
     return replace(fit, R=fit.R[list(keep)], t=fit.t[list(keep)])
+
+
+def without_strays(
+    views: Sequence[View], fits: dict[LensKind, LensFit], size: tuple[int, int]
+) -> tuple[Sequence[View], dict[LensKind, LensFit]]:
+    """The views without single corners that were found in the wrong place, and the fits to what is left.
+
+    A corner goes if it is far off, by what most corners of its picture and of all pictures are, under the model that
+    fits best; a picture that is wrong as a whole is kept, to be named.
+    """
+    for _ in range(ROUNDS):
+        best = min(fits.values(), key=lambda fit: fit.cost)
+        ends = np.cumsum([len(view.points) for view in views])[:-1]
+        parts = [np.linalg.norm(part, axis=1) for part in np.split(best.residuals, ends)]
+        usual = float(np.median(np.concatenate(parts)))
+        kept = [part <= STRAY * max(float(np.median(part)), usual, EXACT) for part in parts]
+        kept = [one if np.mean(one) >= 1.0 - MOST_STRAY else np.ones_like(one) for one in kept]
+        if all(one.all() for one in kept):
+            break
+        views = [View(view.name, view.points[one], view.pixels[one]) for view, one in zip(views, kept, strict=True)]
+        fits = {kind: refine(fit, views, size) for kind, fit in fits.items()}
+    return views, fits
 
 
 def bent(fit: LensFit, board: BoardShape) -> LensFit:
