@@ -26,6 +26,8 @@ _IMAGES = 4  # images of one label in different panes that are looked for
 _CHANCE = 0.25  # share of an image's support with which the label itself stands out from chance
 _TWO = 2.5  # support that three sightings have and two have not
 _TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
+_TWO_SIGHTINGS = 1.5  # support that two have and one has not
+_EXCHANGED = 0.4  # share of a position's support from which another one is no stray wrong name
 _FEW_STOPS = 3  # that agree, up to which other sightings may be right and one of these wrong
 
 
@@ -218,3 +220,23 @@ def support(everything: Adjustment, state: State) -> tuple[Floats, Bools]:
     label[owner.ravel()] = sightings.label
     gain = np.bincount(label, best, len(everything.problem.labels)).astype(np.float64)
     return gain, np.asarray(square < OUTLIER)
+
+
+def exchanged(everything: Adjustment, state: State, found: Hypotheses, located: Bools) -> Bools:
+    """(L,) labels whose names seem to have been exchanged with another's on the way.
+
+    One of two then has a second position where the other hangs, and sightings of that one point at the first's; or both
+    are in one place, and one has another.
+    """
+    points, result = state.points, np.zeros(len(state.points), dtype=np.bool_)
+    doubtful = located & np.isfinite(found.rivals[:, 0]) & (found.rival_gain > _EXCHANGED * found.gain)
+    for i in np.flatnonzero(doubtful).tolist():
+        there = located & (np.linalg.norm(points - found.rivals[i], axis=1) < _SAME_PLACE_M)
+        here = located & (np.linalg.norm(points - points[i], axis=1) < _SAME_PLACE_M)
+        here[i] = False
+        if there.any():
+            gain, _ = support(everything, replace(state, points=np.where(there[:, None], points[i], points)))
+            there &= gain > _TWO_SIGHTINGS
+        result |= there
+        result[i] |= bool(there.any() or here.any())
+    return result

@@ -27,7 +27,7 @@ from ..records import (
 from ..sighting_columns import made
 from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment
-from .hypotheses import at_camera_height
+from .hypotheses import at_camera_height, exchanged
 from .initial import world_rays
 from .known_labels import on_a_line
 from .linear import solve_linear
@@ -103,10 +103,14 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
     notes = [*problem.notes]
     lost = [f"{s.leg}/{s.stop}" for s, ok in zip(problem.survey.stops, optimum.placed, strict=True) if not ok]
     if lost:
-        notes.append(
-            f"leg/stop {', '.join(lost)} share too few labels with the rest to be joined to it; their poses are in "
-            "their own odometry frame; map some of the same labels from both"
-        )
+        why = "share too few labels with the rest to be joined to it"
+        mend = "map some of the same labels from both"
+        if len(asked.moves.before) == 0:
+            why, mend = (
+                "cannot be joined, because no leg has two stops, so that no label has a place",
+                "make longer legs",
+            )
+        notes.append(f"leg/stop {', '.join(lost)} {why}; their poses are in their own odometry frame; {mend}")
     if doubt.text is not None:
         notes.append(doubt.text)
     if (caution := on_a_line(problem)) is not None:
@@ -137,8 +141,9 @@ class _Tally:
 
     `row` is its place in the adjustment or -1, `known` in the problem's known labels or -1, `sigma` its largest
     standard deviation, `position` and `covariance` as in the map, the latter by row, `agreeing` and `doubting` sums of
-    its sightings' probabilities, `in_front` (L, 3) see _in_front, `elsewhere` (L,) see _elsewhere, `in_glass` see
-    _in_glass; `unchecked` (L,) are those whose two sightings meet wherever these point, because they are level.
+    its sightings' probabilities, `in_front` (L, 3) see _in_front, `elsewhere` (L,) see _elsewhere, `exchanged` (L,)
+    those whose names were perhaps exchanged, `in_glass` see _in_glass; `unchecked` (L,) are those whose two sightings
+    meet wherever these point, because they are level.
     """
 
     asked_stops: list[int]
@@ -155,6 +160,7 @@ class _Tally:
     in_front: Floats
     image: list[bool]
     elsewhere: Bools
+    exchanged: Bools
     unchecked: Bools
     in_glass: dict[int, tuple[str, Floats | None]]
 
@@ -193,6 +199,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
         in_front=in_front,
         image=image,
         elsewhere=_elsewhere(optimum),
+        exchanged=exchanged(Adjustment(problem, s), optimum.state, optimum.hypotheses, row >= 0),
         unchecked=at_camera_height(problem, optimum.state.points)
         & (np.bincount(s.label[inlier], minlength=count) == 2),
         in_glass=_in_glass(optimum),
@@ -251,6 +258,12 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
         ways = ((optimum.state, optimum.rival.chosen_cost), (optimum.rival.state, optimum.rival.cost))
         candidates = tuple(Candidate(_vector(way.points[i]), cost) for way, cost in ways)
         return MappedLabel(label, "ambiguous", None, None, count, inliers, reason, candidates)
+    if tally.exchanged[i]:
+        rival = optimum.hypotheses.rivals[i]
+        reason = (
+            "conflicting identities: its name and another label's were exchanged on the way; flash both again, alone"
+        )
+        return _ambiguous(optimum, i, label, count, inliers, [rival] if np.isfinite(rival[0]) else [], reason)
     if tally.image[i]:
         reason = "perhaps an image in glass: one sighting puts the label nearer; map it from another stop"
         return _ambiguous(optimum, i, label, count, inliers, [tally.in_front[i]], reason)
