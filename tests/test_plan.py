@@ -22,7 +22,7 @@ from robotd.solver.viewing_angles import force_field, viewing_angles
 from robotd.solver.ways import along_line, over_floor
 from robotd.solver_main import main
 from tests.bench.stores import make_store, survey_of
-from tests.campaign.plan import compare, drive
+from tests.campaign.plan import EVERY, compare, drive
 from tests.operated import operated
 
 NOWHERE = np.zeros((0, 3))
@@ -97,6 +97,39 @@ def test_what_a_stop_is_expected_to_teach_is_what_solving_with_it_finds(course):
     both = [i for i in optimum.adjustment.labels if names[i] in found]
     solved = [np.sqrt(np.trace(np.array(found[names[i]].covariance))) for i in both]
     np.testing.assert_allclose(sigma[both], solved, rtol=0.1)
+
+
+def test_taking_a_flash_back_leaves_what_is_known_without_it(course, begun):
+    optimum = optimise(build_problem(begun))
+    belief = Belief(optimum, 1.5, 0.7, NOWHERE, 1.0)
+    pose = optimum.problem.stop_entries(optimum.state)[-1, :3]
+    views = belief.views((pose + [0.3, 0.1, 0.0])[None], 0.1, 9.0)
+    room, entry = belief.with_stop(belief.P)
+    link = belief.move(pose, belief.stop_entries(2), pose + [0.3, 0.1, 0.0], entry, np.diag([1e-5, 1e-5, 1e-4]))
+
+    def rows(kept):
+        return link.joined(belief.sight(views, np.flatnonzero(kept), np.ones(kept.sum()), entry))
+
+    everything = rows(np.ones(len(views.label), dtype=bool))
+    owner = np.concatenate([[-1, -1, -1], np.repeat(views.label, 2)])
+    told = belief.told(everything, belief.take(room, everything), owner)
+    gone = views.label < 0
+    for label in np.unique(views.label)[[0, 3, 5]]:
+        gone |= views.label == label
+        known = belief.traces_with(rows(~gone), room)
+        np.testing.assert_allclose(told.without(label), known, rtol=1e-4, atol=1e-9)
+        told.forget(label)
+        np.testing.assert_allclose(belief.traces(told.known()), known, rtol=1e-4, atol=1e-9)
+
+
+def test_what_two_rooms_hang_on_is_seen_from_more_than_one_stop():
+    # labels of both rooms show at once on 1.2 m of the line only
+    warehouse = drive("warehouse", 100, every=EVERY)
+    made = warehouse.fixed[: 1 + int(np.searchsorted(warehouse.along[warehouse.fixed], 9.5))]
+    study = plan(warehouse.at(made, [None] * len(made)), warehouse.line)
+    at = np.array([warehouse.along[made[-1]], *study.plan.distances()])
+    assert np.diff(at).max() < 1.35
+    assert len(study.plan.stops[0].skipped) > 0
 
 
 def test_a_plan_of_the_rest_of_the_line_places_what_is_ahead(course, begun):

@@ -27,6 +27,7 @@ _POSE_SIGMA = 10.0  # metres and radians: where a stop would be, before anything
 _NO_MOVES = Moves(
     np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
 )
+_LEAST_LEFT = 1e-9  # of a measurement's variance that nothing else tells: below is rounding
 MARGIN_PX = 2.0  # a light nearer to the image's border is not found
 
 
@@ -148,10 +149,13 @@ class Belief:
         part = _conditioned(rows, P, labels)
         return np.asarray(self.traces(P) - (part**2).sum(axis=1).reshape(-1, 3).sum(axis=1))
 
-    def pose_with(self, rows: Rows, P: Floats, entry: int) -> Floats:
-        """(3,) variances of x, y, heading of the stop whose entries begin at `entry`, after measuring rows."""
-        pose = slice(entry, entry + 3)
-        return np.asarray(np.diagonal(P)[pose] - (_conditioned(rows, P, pose) ** 2).sum(axis=1))
+    def told(self, rows: Rows, P: Floats, owner: Ints) -> Told:
+        """P, in which rows were measured, to be asked how much less it were without those of one `owner` (R,)."""
+        H = rows.matrix(len(P))
+        G, labels = H @ P, slice(self._first_point, self._first_point + 3 * len(self.points))
+        K = H @ np.ascontiguousarray(G.T)
+        owners = {k: np.flatnonzero(owner == k) for k in np.unique(owner).tolist()}
+        return Told(self.traces(P), owners, P, labels, G, 0.5 * (K + K.T), [])
 
     def with_stop(self, P: Floats) -> tuple[Floats, int]:
         """P with room for one more stop, and the first of its five entries."""
@@ -264,6 +268,54 @@ class Belief:
         order = order[linear.valid[order]]
         by_place, by_camera = linear.by_frame[order, :, :STOP], linear.by_frame[order, :, STOP:]
         return Views(place[order], seer[order], label[order], by_place, by_camera, linear.by_point[order])
+
+
+@dataclass(slots=True, eq=False)
+class Told:
+    """How sure labels are after rows were measured, and how much less without those of one owner.
+
+    Rows h taken back from a covariance P in which they were measured leave P + P h' (I - h P h')^-1 h P.
+
+    Attributes
+    ----------
+    traces : (L,) array
+        Sum of the variances of each label's coordinates.
+    owners : dict
+        Rows of each owner.
+    """
+
+    traces: Floats
+    owners: dict[int, Ints]
+    _P: Floats
+    _labels: slice
+    _G: Floats  # (R, N) covariances of the rows with the state
+    _K: Floats  # (R, R) of the rows among themselves
+    _lost: list[Floats]
+
+    def without(self, owner: int) -> Floats:
+        """(L,) traces if an owner's rows had not been measured."""
+        part = self._root(owner) @ self._G[self.owners[owner], self._labels]
+        return np.asarray(self.traces + (part**2).sum(axis=0).reshape(-1, 3).sum(axis=1))
+
+    def forget(self, owner: int) -> None:
+        """Take an owner's rows back."""
+        root, mine = self._root(owner), self.owners[owner]
+        self.traces = self.without(owner)
+        G, K = root @ self._G[mine], root @ self._K[mine]
+        self._G += K.T @ G
+        self._K += K.T @ K
+        self._lost.append(G)
+
+    def known(self) -> Floats:
+        """P without what was forgotten."""
+        lost = np.concatenate(self._lost) if self._lost else np.zeros((0, len(self._P)))
+        return np.asarray(self._P + lost.T @ lost)
+
+    def _root(self, owner: int) -> Floats:
+        """A matrix whose transpose times itself is (I - h P h')^-1."""
+        mine = self.owners[owner]
+        values, vectors = np.linalg.eigh(np.eye(len(mine)) - self._K[np.ix_(mine, mine)])
+        return np.asarray(vectors.T / np.sqrt(np.maximum(values, _LEAST_LEFT))[:, None])
 
 
 def _conditioned(rows: Rows, P: Floats, kept: slice) -> Floats:

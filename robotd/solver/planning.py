@@ -11,16 +11,18 @@ with a probability that falls with k as the share of wrong sightings does.
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
 from ..plan_records import Plan, PlannedFlash, PlannedLabel, PlannedStop
 from ..records import Floats, Map, Pose, Survey
 from ..typed_json import many_records
-from .belief import Rows
+from .belief import Rows, Told
 from .mapping import WIDEST_SIGMA_M, to_map
 from .neighbourhood import nearby
 from .outlook import GUESSES_M, Outlook, distances
@@ -31,9 +33,10 @@ from .wheel_errors import SLIPPED
 
 _WRONG_M = 0.5  # error of a position that is wrong
 _APART = 0.35  # of the labels' usual distance lies between two stops: nearer ones see them from almost the same side
-_LONGEST = 0.75  # of the reach may lie between two stops: farther apart they share too few labels to be joined
+_LONGEST = 0.75  # of it may: what walls hide from both, as behind a doorway, hangs on nothing but one stop between them
+_AHEAD = 0.75  # of the reach is looked ahead for each stop that is planned
+_AT_ONCE = 600  # rows of flashes are judged together, which takes time as their square
 _JOINING = 6  # labels are asked at each stop, where so many show: one wrong name must not turn the robot's pose
-_AS_SURE = 1.1  # times as uncertain the robot's pose may get by leaving labels out: whatever it sees next inherits that
 _SLIP_EVERY_M = 20.0  # a wheel slips, and then a move says little
 _FLOOR = np.diag([1e-4, 1e-4, 1e-4]) ** 2
 
@@ -43,9 +46,9 @@ class PlanSettings:
     """What a plan is to weigh.
 
     `stop_s` and `flash_s` are the seconds that a stop and a label asked there take. A stop is worth making if the
-    labels are by the fraction `least` more uncertain without it; at a stop labels are left out as long as that leaves
-    them by no more than the fraction `spare` more uncertain. A plan ends earlier after `most_stops`, or when every
-    label is known to `target_m`.
+    labels are by the fraction `least` more uncertain without it. A label is worth asking there if without it all labels
+    together are more uncertain by the fraction `spare` of what one of them is. A plan ends earlier after
+    `most_stops`, or when every label is known to `target_m`.
     """
 
     most_stops: int = 20
@@ -118,7 +121,7 @@ def plan(
         result, (reach, _) = to_map(problem, optimum), distances(optimum)
         way = _way(optimum, line, free, again)
         settings = settings or PlanSettings()
-        near, way, note = nearby(optimum, result, way, settings.most_stops * _LONGEST * reach, reach)
+        near, way, note = nearby(optimum, result, way, settings.most_stops * _AHEAD * reach, reach)
         return _Planner(Outlook(near, result, way), settings, () if note is None else (note,)).study()
 
 
@@ -234,7 +237,7 @@ class _Planner:
             _, choice, now, agreeing = best
             P = belief.take(room, self._rows(choice))
             chosen.append(choice)
-        return self._bridged(chosen), gains
+        return self._bridged(chosen)[: settings.most_stops], gains
 
     def _bridged(self, chosen: list[_Choice]) -> list[_Choice]:
         """With further stops where two would lie too far apart to share labels."""
@@ -244,7 +247,7 @@ class _Planner:
         result: list[_Choice] = []
         at = self.way.here if self.way.here is not None else float(along[chosen[0].place])
         for choice in chosen:
-            pieces = math.ceil(max(float(along[choice.place]) - at, 0.0) / (_LONGEST * self.outlook.reach) - 1e-9)
+            pieces = math.ceil(max(float(along[choice.place]) - at, 0.0) / (_LONGEST * self.outlook.depth) - 1e-9)
             for k in range(1, pieces):
                 place = int(np.abs(along - (at + k * (float(along[choice.place]) - at) / pieces)).argmin())
                 result.append(replace(choice, place=place, asked=self.views.at(place)))
@@ -269,52 +272,72 @@ class _Planner:
         if not np.isfinite(at).all() or k == len(chosen) - 1:
             return True
         before = at[k - 1] if k else at[0] if self.way.here is None else self.way.here
-        return bool(at[k + 1] - before <= _LONGEST * self.outlook.reach)
+        return bool(at[k + 1] - before <= _LONGEST * self.outlook.depth)
 
     def _sparing(self, chosen: list[_Choice], P: Floats) -> list[_Choice]:
-        """Without labels that add next to nothing at a stop.
+        """Without labels that add next to nothing, the least useful flash of the whole plan first.
 
-        Each stop is judged by what is known when the robot stands there, not by what later stops could make good: the
-        robot may never get there, and a plan that is renewed at every stop would put off every label.
+        Flashes are judged by what is known at the plan's end, because what is uncertain about a pose in a doorway is
+        handed on to all behind it, and what a stop leaves out of a label others may make good. Each must be worth the
+        same, at whichever stop: so a plan that is made anew at the next stop leaves out the same ones.
         """
-        agreeing, result = self.outlook.agreeing, list[_Choice]()
+        count, agreeing, done = len(self.optimum.problem.labels), self.outlook.agreeing.copy(), list[_Choice]()
         for choice in chosen:
-            room, entry = self.belief.with_stop(P)
-            choice = replace(choice, entry=entry, link=self._link(choice.place, result, entry))
-            traces = self.belief.traces_with(self._rows(choice), room)
-            losses = self._losses(traces, self._agreeing_with(agreeing, choice.asked))
-            allowed = float(losses.sum()) + self._margin(losses, self.settings.spare)
-            result.append(self._least_asked(choice, room, agreeing, allowed))
-            P = self.belief.take(room, self._rows(result[-1]))
-            agreeing = self._agreeing_with(agreeing, result[-1].asked)
+            P, entry = self.belief.with_stop(P)
+            done.append(replace(choice, entry=entry, link=self._link(choice.place, done, entry)))
+            P = self.belief.take(P, self._rows(done[-1]))
+            agreeing = self._agreeing_with(agreeing, choice.asked)
+        left_out, rows, owners = set[int](), list[Rows](), list[Ints]()
+        for k, choice in enumerate(done):
+            named = choice.asked[self.views.label[choice.asked] < count]
+            rows.append(self.belief.sight(self.views, named, self.chance[named], choice.entry))
+            owners.append(np.repeat(k * count + self.views.label[named], 2))
+            if sum(map(len, owners)) >= _AT_ONCE or k == len(done) - 1:
+                told = self.belief.told(reduce(Rows.joined, rows), P, np.concatenate(owners))
+                left_out |= self._needless(told, agreeing, done)
+                P, rows, owners = told.known(), [], []
+        result = []
+        for k, choice in enumerate(done):
+            labels = self.views.label[choice.asked]
+            kept = [k * count + label not in left_out for label in labels.tolist()]
+            result.append(replace(choice, asked=choice.asked[np.array(kept, dtype=np.bool_) | (labels >= count)]))
         return result
 
-    def _least_asked(self, choice: _Choice, P: Floats, agreeing: Floats, allowed: float) -> _Choice:
-        """A stop without as many labels as it takes to reach the allowed uncertainty, the least useful ones first."""
-        labels = self.views.label[choice.asked]
-        names = np.unique(labels)
-        if not len(names):
-            return choice
+    def _needless(self, told: Told, agreeing: Floats, chosen: Sequence[_Choice]) -> set[int]:
+        """Owners of the rows that can be spared: flashes, counted by stop and label; fewer stops agree then."""
+        count, result, chance = len(self.optimum.problem.labels), set[int](), dict[int, float]()
+        for k, choice in enumerate(chosen):
+            for label, share in zip(self.views.label[choice.asked].tolist(), self.chance[choice.asked], strict=True):
+                if k * count + label in told.owners and label < count:
+                    chance[k * count + label] = max(chance.get(k * count + label, 0.0), float(share))
+        asked = np.bincount([owner // count for owner in chance], minlength=len(chosen))
 
-        def without(left_out: Ints) -> _Choice:
-            return replace(choice, asked=choice.asked[~np.isin(labels, left_out)])
+        def rise(owner: int) -> float:
+            fewer = agreeing.copy()
+            fewer[owner % count] -= chance[owner]
+            return float(self._losses(told.without(owner), fewer).sum()) - now
 
-        losses = [self._worth(without(names[k : k + 1]), P, agreeing)[0] for k in range(len(names))]
-        names = names[np.argsort(losses, kind="stable")]
-        seen = names[names < len(self.optimum.problem.labels)]
-        sure = self._pose_sigma(choice, P)
-        low, high = 0, int(np.searchsorted(np.cumsum(np.isin(names, seen)), len(seen) - _JOINING, side="right"))
-        while low < high:
-            middle = (low + high + 1) // 2
-            fewer = without(names[:middle])
-            fits = self._worth(fewer, P, agreeing)[0] <= allowed and self._pose_sigma(fewer, P) <= _AS_SURE * sure
-            low, high = (middle, high) if fits else (low, middle - 1)
-        return without(names[:low])
-
-    def _pose_sigma(self, choice: _Choice, P: Floats) -> float:
-        """How uncertain the robot's own place is at a stop, as metres at a label's usual distance."""
-        x, y, heading = self.belief.pose_with(self._rows(choice), P, choice.entry)
-        return float(np.sqrt(max(x + y + heading * self.outlook.depth**2, 0.0)))
+        losses = self._losses(told.traces, agreeing)
+        placed = losses[(self.weights > 0.0) & (losses < WIDEST_SIGMA_M * self.weights)]
+        price, now = self.settings.spare * float(np.median(placed)) if len(placed) else 0.0, float(losses.sum())
+        queue = [(rise(owner), owner) for owner in chance]
+        heapq.heapify(queue)
+        while queue and queue[0][0] <= price:
+            _, owner = heapq.heappop(queue)
+            if asked[owner // count] <= _JOINING:
+                continue
+            worth = rise(owner)  # by what was left out since it was queued: that made it worth more
+            if queue and worth > queue[0][0]:
+                heapq.heappush(queue, (worth, owner))
+                continue
+            if worth > price:
+                break
+            told.forget(owner)
+            result.add(owner)
+            agreeing[owner % count] -= chance[owner]
+            asked[owner // count] -= 1
+            now += worth
+        return result
 
     def _with(self, chosen: Sequence[_Choice], P: Floats) -> tuple[Floats, Floats, float]:
         """The joint covariance with some stops made, in that order, who agrees then, and the losses' sum."""
@@ -414,7 +437,7 @@ class _Planner:
 
     def _notes(self, chosen: Sequence[_Choice], is_done: bool) -> tuple[str, ...]:
         settings, notes = self.settings, []
-        if len(chosen) == settings.most_stops:
+        if len(chosen) >= settings.most_stops:
             notes.append(f"{settings.most_stops} stops were planned, which is the most asked for")
         elif is_done:
             notes.append(f"every label is known to {1e3 * settings.target_m:.0f} mm then")
