@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         for what, value, sigma in zip(("fx", "fy", "cx", "cy"), result.camera.matrix, sigmas, strict=True)
     )
     corners = sum(len(view.points) for view in result.views)
-    _say(f"{len(views)} pictures, {corners} corners, {result.kind} {result.rms_px:.3f} px rms; {numbers} px")
+    _say(f"{len(result.views)} pictures, {corners} corners, {result.kind} {result.rms_px:.3f} px rms; {numbers} px")
     if result.left_out:
         _say(f"{result.left_out} corners were found in the wrong place and left out")
     _say(f"held out, px rms: {result.held_out_words}")
@@ -249,6 +249,7 @@ def _summary(result: LensCalibration) -> dict[str, Any]:
         "disagreement": result.disagreement,
         "corners": sum(len(view.points) for view in result.views),
         "corners_left_out": result.left_out,
+        "pictures_left_out": list(result.strangers),
         "distances_m": list(result.distances),
         "board": None if result.bend is None else asdict(result.bend),
         "pictures": {

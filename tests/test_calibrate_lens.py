@@ -227,18 +227,28 @@ def test_boards_at_one_distance_are_refused():
     refused(views("brown-conrady", BROWN, near=0.38, far=0.4), "all at nearly the same distance", whole=False)
 
 
-def test_a_picture_that_does_not_belong_is_named():
-    scene = views("brown-conrady", BROWN)
-    scene[7] = View("bent", POINTS, scene[7].pixels + 3.0 * np.sin(np.arange(108).reshape(54, 2)))
-    refused(scene, "worst bent with")
+def test_a_picture_that_does_not_belong_is_named_and_left_out_but_not_a_quarter_of_them():
+    scene = views("brown-conrady", BROWN, 16)
+    for k, name in ((7, "bent"), (8, "worse"), (9, "worst"), (10, "bad")):
+        scene[k] = View(name, POINTS, scene[k].pixels + (2.0 + 0.2 * k) * np.sin(np.arange(108).reshape(54, 2)))
+    refused(scene, "worst bad with")
+    result = calibrate_lens([*scene[:8], *scene[11:]], SIZE, "front", ("brown-conrady",))
+    assert len(result.strangers) == 1
+    assert any(words.startswith("left out: ") and "worst bent with" in words for words in result.doubts)
+    assert (np.abs(np.array(result.camera.matrix) - BROWN[:4]) < 3.5 * result.sigmas).all()
 
 
-def test_a_picture_of_another_camera_is_named_though_it_fits_by_itself():
+def test_a_picture_of_another_camera_is_named_and_left_out_though_it_fits_by_itself():
     scene = views("brown-conrady", BROWN, 16)
     longer = BROWN * np.array([1.12, 1.12, *[1.0] * 7])
-    refused(
-        [*scene, View("other", POINTS, views("brown-conrady", longer, 1, seed=2)[0].pixels)], "^other shows another"
-    )
+    others = [
+        View(f"other{k}", POINTS, view.pixels) for k, view in enumerate(views("brown-conrady", longer, 3, seed=2))
+    ]
+    result = calibrate_lens([*scene, others[0]], SIZE, "front", ("brown-conrady",))
+    assert len(result.views) == 16
+    assert result.strangers[0].startswith("other0 shows another lens")
+    assert (np.abs(np.array(result.camera.matrix) - BROWN[:4]) < 3.5 * result.sigmas).all()
+    refused([*scene, *others], "^other. shows another")
 
 
 def test_corners_that_leave_out_all_borders_a_little_are_refused_or_told():

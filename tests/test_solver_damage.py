@@ -80,7 +80,7 @@ def test_a_tenth_of_wrong_pixels_and_odometry_places_nothing_wrongly(store, seed
     )
     result = solve(replace(spoiled, stops=stops))
     errors = [np.linalg.norm(np.subtract(m.position, truth[m.label])) for m in result.labels if m.position]
-    # a fifth of the sightings is wrong: labels with two left at the cameras' height are not placed, as any two meet there
+    # a fifth of the sightings is wrong: labels with two left at the cameras' height, where any two meet, are not placed
     assert len(errors) >= 0.75 * len(truth)
     assert max(errors) < 0.15
 

@@ -19,6 +19,7 @@ from ..errors import SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import skew
 from ..records import CameraModel, Floats
+from .board_pictures import distances_of, empty_borders, refusal, too_alike, too_few
 from .board_shape import BoardShape
 from .lens_fit import (
     LensFit,
@@ -34,17 +35,12 @@ from .lens_fit import (
     without_strays,
 )
 
-LEAST_VIEWS = 8  # different pictures: Zhang (PAMI 22(11), 2000) needs 3, and held-out pictures must stay out
-LEAST_MOVE = 0.01  # of the picture's width, by which corners must differ between different pictures
-LEAST_TURN = math.radians(20.0)  # between the boards' planes
-LEAST_DEPTH = 1.3  # ratio of the farthest board to the nearest
-BORDER = 0.25  # of the picture's side: corners must come as near to each border. Drawn lenses with 0.15 px of what no
-# model has, corners up to a quarter from one border: errors there reach 0.46 px; up to 35 %, 0.92 px
 PARTLY = "; or, if what is seen there is of no use, --partial"
 MOST_RMS = 1.0  # px
 MOST_SIGMA_FOCAL = 0.01  # of the focal length
 MOST_SIGMA_PIXEL = 0.5  # px, up to which the lens is called valid
 WORST = 5.0  # times the median of all pictures: the rms of one that does not belong to them
+MOST_STRANGERS = 8  # one picture of so many may be left out
 STRANGE = 15.0  # times what the corners' scatter, or the median picture, explains: a lens of its own. Pictures of
 # lenses 5 % longer reach 34, boards that bend by 1 mm from picture to picture 5 times their median
 SHAKY = 1.5  # disagreement from which it is told
@@ -109,6 +105,8 @@ class LensCalibration:
         Fitted less seen corners, in pixels.
     distances : (float, float)
         From the camera to the middle of the nearest and of the farthest board, in metres.
+    strangers : tuple of str
+        Pictures that were left out because they do not fit what the others show, and how.
     share : float
         Of the picture, within reach.
     bend : Bend or None
@@ -131,6 +129,7 @@ class LensCalibration:
     bend: Bend | None
     disagreement: float
     distances: tuple[float, float]
+    strangers: tuple[str, ...] = ()
 
     @property
     def held_out_words(self) -> str:
@@ -153,7 +152,7 @@ class LensCalibration:
     @property
     def doubts(self) -> tuple[str, ...]:
         """What a person must know about the board and the pictures."""
-        words = []
+        words = [f"left out: {words}" for words in self.strangers]
         if self.bend is not None:
             one = self.bend
             words.append(
@@ -190,6 +189,7 @@ def calibrate_lens(
 
     Chosen is the first of `ORDER`, with a flat board or else with a bent one, whose held-out squared error is not worse
     than the best one's by more than 2 %, or than twice the standard error of the difference over the pictures.
+    Up to one picture in eight that does not fit what the others show is left out and named.
 
     Parameters
     ----------
@@ -210,9 +210,33 @@ def calibrate_lens(
     SolverError
         If the pictures do not determine the lens; the message names all that is missing.
     """
-    few, border = _too_few(views, size), _border(views, size) if whole else []
+    given, strangers = views, list[_Stranger]()
+    while True:
+        try:
+            found = _calibrated(views, size, name, kinds, whole)
+        except _Stranger as stranger:
+            if (1 + len(strangers)) * MOST_STRANGERS > len(given):
+                raise (strangers or [stranger])[0] from None
+            strangers.append(stranger)
+            views = [view for view in views if view.name != stranger.picture]
+        else:
+            return replace(found, strangers=tuple(str(one) for one in strangers))
+
+
+class _Stranger(SolverError):
+    """One picture does not fit what all others show."""
+
+    def __init__(self, picture: str, words: str) -> None:
+        super().__init__(words)
+        self.picture = picture
+
+
+def _calibrated(
+    views: Sequence[View], size: tuple[int, int], name: str, kinds: Sequence[LensKind], whole: bool
+) -> LensCalibration:
+    few, border = too_few(views, size), empty_borders(views, size) if whole else []
     if few or border:
-        raise SolverError(_refusal(few + border) + (PARTLY if border else ""))
+        raise SolverError(refusal(few + border) + (PARTLY if border else ""))
     flat = {kind: fit for kind in ORDER if kind in kinds and (fit := fit_lens(kind, views, size)) is not None}
     if not flat:
         raise SolverError("no lens model fits the corners; is the board flat, and are all pictures from one camera?")
@@ -232,14 +256,15 @@ def calibrate_lens(
     apart, parts = _disagreement(fit)
     stranger = int(np.argmax(parts))
     if parts[stranger] > STRANGE * max(float(np.median(parts)), 1.0):
-        raise SolverError(
+        raise _Stranger(
+            views[stranger].name,
             f"{views[stranger].name} shows another lens than all other pictures do; leave it out if it is of another"
-            " camera, of other settings (zoom, focus, cropping), or of another board"
+            " camera, of other settings (zoom, focus, cropping), or of another board",
         )
     covariance = _covariance(fit) * max(apart, 1.0) ** 2
     lens_covariance = covariance[: len(fit.lens), : len(fit.lens)]
-    distances = _distances(fit, views)
-    missing = _flat(fit, distances)
+    distances = distances_of(fit, views)
+    missing = too_alike(fit, distances)
     relative = float((np.sqrt(np.diag(lens_covariance))[:2] / fit.lens[:2]).max())
     if not relative <= MOST_SIGMA_FOCAL and not missing:
         missing = [
@@ -247,13 +272,13 @@ def calibrate_lens(
             " in view and tilted by 30 to 45 degrees about both its sides"
         ]
     if missing:
-        raise SolverError(_refusal(missing))
+        raise SolverError(refusal(missing))
     record = camera_model(kind, fit.lens, size, name)
     reach = _reach(record, kind, fit.lens, lens_covariance, views)
     share, seen = _share(record, reach), _share(record, _farthest(record, views))
     if whole and seen < LEAST_SHARE:
         middle = f"all corners lie in a circle around the middle {100.0 * seen:.0f} % of the picture; hold the board"
-        raise SolverError(_refusal([f"{middle} into its corners, too"]) + PARTLY)
+        raise SolverError(refusal([f"{middle} into its corners, too"]) + PARTLY)
     far = max(math.hypot(u - fit.lens[2], v - fit.lens[3]) for u in (0, size[0] - 1) for v in (0, size[1] - 1))
     return LensCalibration(
         record if reach >= far else replace(record, valid_radius_px=round(reach, 1)),
@@ -272,80 +297,17 @@ def calibrate_lens(
     )
 
 
-# ---- what is missing -------------------------------------------------------------------------------------------------
-
-
-def _refusal(missing: Sequence[str]) -> str:
-    return "the pictures do not determine the lens: " + "; ".join(missing)
-
-
-def _too_few(views: Sequence[View], size: tuple[int, int]) -> list[str]:
-    """A board that stayed where it was tells nothing new."""
-    different: list[dict[tuple[float, ...], Floats]] = []
-    for view in views:
-        seen = dict(zip(map(tuple, view.points.tolist()), view.pixels, strict=True))
-        if not any(_same(seen, one, LEAST_MOVE * size[0]) for one in different):
-            different.append(seen)
-    if len(different) >= LEAST_VIEWS:
-        return []
-    again = f" ({len(views)}, but in some the board did not move)" if len(different) < len(views) else ""
-    pictures = "picture" if len(different) == 1 else "pictures"
-    return [f"{len(different)} different {pictures}{again}; take {LEAST_VIEWS} or more, 20 are better"]
-
-
-def _same(a: dict[tuple[float, ...], Floats], b: dict[tuple[float, ...], Floats], most: float) -> bool:
-    """Whether the corners that two pictures share, half of them or more, are within so many pixels of each other."""
-    both = a.keys() & b.keys()
-    return 2 * len(both) >= max(len(a), len(b)) and all(np.abs(a[one] - b[one]).max() < most for one in both)
-
-
-def _border(views: Sequence[View], size: tuple[int, int]) -> list[str]:
-    corners = np.concatenate([view.pixels for view in views])
-    low, high = corners.min(axis=0) / size, 1.0 - corners.max(axis=0) / size
-    gaps = {"left": low[0], "right": high[0], "upper": low[1], "lower": high[1]}
-    wide = {side: gap for side, gap in gaps.items() if gap > BORDER}
-    if not wide:
-        return []
-    where = ", ".join(f"{side} ({math.ceil(100.0 * gap)} %)" for side, gap in wide.items())
-    return [
-        f"no corner lies near the {where} border, where the lens bends most; hold the board there, to within"
-        f" {100.0 * BORDER:.0f} % of the picture"
-    ]
-
-
-def _distances(fit: LensFit, views: Sequence[View]) -> Floats:
-    """(P,) metres from the camera to the middle of each board."""
-    middles = [R @ view.points.mean(axis=0) + t for R, t, view in zip(fit.R, fit.t, views, strict=True)]
-    return np.asarray(np.linalg.norm(middles, axis=1))
-
-
-def _flat(fit: LensFit, distances: Floats) -> list[str]:
-    missing = []
-    normals = fit.R[:, :, 2]
-    turn = float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)).max())
-    if turn < LEAST_TURN:
-        missing.append(
-            f"the boards are tilted by only {math.degrees(turn):.0f} degrees against each other, so the focal length"
-            f" cannot be told from the distance; tilt them by 30 to 45 degrees, to all sides"
-        )
-    if distances.max() < LEAST_DEPTH * distances.min():
-        missing.append(
-            f"the boards are all at nearly the same distance ({distances.min():.2f} to {distances.max():.2f} m); hold"
-            " some at half the distance and some at twice"
-        )
-    return missing
-
-
 def _consistent(fit: LensFit, views: Sequence[View]) -> None:
-    """Raise SolverError if the corners do not fit one flat board and one lens, or one picture does not."""
+    """Raise _Stranger if the corners do not fit one flat board and one lens, or one picture does not."""
     counts = np.cumsum([len(view.points) for view in views])[:-1]
     each = np.array([math.sqrt(float(np.mean(part**2))) for part in np.split(fit.residuals, counts)])
     rms = math.sqrt(fit.cost / fit.residuals.size)
     worst = int(np.argmax(each))
     if rms > MOST_RMS or each[worst] > max(WORST * float(np.median(each)), 0.5):
-        raise SolverError(
+        raise _Stranger(
+            views[worst].name,
             f"the corners fit one lens only to {rms:.2f} px rms, worst {views[worst].name} with {each[worst]:.2f} px;"
-            " leave it out if it is blurred or of another camera; otherwise, is the board flat and stiff?"
+            " leave it out if it is blurred or of another camera; otherwise, is the board flat and stiff?",
         )
 
 
