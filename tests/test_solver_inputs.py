@@ -1,8 +1,10 @@
 """`robotd-solver plan` and `evaluate` on damaged files: words that name the file and the place, and no half output."""
 
 import contextlib
+import errno
 import io
 import json
+import os
 import tempfile
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from robotd.errors import InputError
 from robotd.files import load_plan, map_to_json, survey_to_json
 from robotd.plan_tool import load_line
 from robotd.solver import solve
+from robotd.solver.figure import save_picture
 from robotd.solver_main import main
 from tests.test_solver_main import TRUTH, a_survey
 from tests.test_typed_json import damaged
@@ -174,3 +177,19 @@ def test_a_line_with_a_cell_larger_than_any_reader_takes_is_no_table(tmp_path):
     (tmp_path / "line.csv").write_text('x,y\n"' + "1" * 200_000 + '",2\n')
     with pytest.raises(InputError, match=r"line.csv: not a table: .*; expected the header x,y"):
         load_line(tmp_path / "line.csv")
+
+
+def test_a_picture_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "map.png"
+    save_picture(path, b"old")
+    write = Path.write_bytes
+
+    def full(self, data):
+        write(self, data[:2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(InputError, match=r"map\.png: cannot be written: No space left on device"):
+        save_picture(path, b"new one")
+    assert path.read_bytes() == b"old"
+    assert [one.name for one in tmp_path.iterdir()] == ["map.png"]

@@ -38,9 +38,18 @@ def save_figure(path: Path, figure: Any) -> None:
 
 
 def save_picture(path: str | Path, data: bytes) -> None:
-    """Write a picture or page; raises InputError if that fails."""
+    """Write a picture or page, whole or not at all; raises InputError if that fails."""
+    path = Path(path)
+    part = path.with_name(f".{path.name}.new")
     try:
-        Path(path).write_bytes(data)
+        if path.exists() and not path.is_file():  # a pipe has nothing to be replaced
+            path.write_bytes(data)
+            return
+        try:
+            part.write_bytes(data)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
