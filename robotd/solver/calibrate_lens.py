@@ -40,7 +40,7 @@ MOST_RMS = 1.0  # px
 MOST_SIGMA_FOCAL = 0.01  # of the focal length
 MOST_SIGMA_PIXEL = 0.5  # px, up to which the lens is called valid
 WORST = 5.0  # times the median of all pictures: the rms of one that does not belong to them
-MOST_STRANGERS = 8  # one picture of so many may be left out
+MOST_STRANGERS = 4  # one picture of so many may be left out
 STRANGE = 15.0  # times what the corners' scatter, or the median picture, explains: a lens of its own. Pictures of
 # lenses 5 % longer reach 34, boards that bend by 1 mm from picture to picture 5 times their median
 SHAKY = 1.5  # disagreement from which it is told
@@ -152,7 +152,7 @@ class LensCalibration:
     @property
     def doubts(self) -> tuple[str, ...]:
         """What a person must know about the board and the pictures."""
-        words = [f"left out: {words}" for words in self.strangers]
+        words = list(self.strangers)
         if self.bend is not None:
             one = self.bend
             words.append(
@@ -189,7 +189,7 @@ def calibrate_lens(
 
     Chosen is the first of `ORDER`, with a flat board or else with a bent one, whose held-out squared error is not worse
     than the best one's by more than 2 %, or than twice the standard error of the difference over the pictures.
-    Up to one picture in eight that does not fit what the others show is left out and named.
+    Up to one picture in four that does not fit what the others show is left out and named.
 
     Parameters
     ----------
@@ -220,15 +220,15 @@ def calibrate_lens(
             strangers.append(stranger)
             views = [view for view in views if view.name != stranger.picture]
         else:
-            return replace(found, strangers=tuple(str(one) for one in strangers))
+            return replace(found, strangers=tuple(one.told for one in strangers))
 
 
 class _Stranger(SolverError):
     """One picture does not fit what all others show."""
 
-    def __init__(self, picture: str, words: str) -> None:
+    def __init__(self, picture: str, words: str, how: str) -> None:
         super().__init__(words)
-        self.picture = picture
+        self.picture, self.told = picture, f"{picture} was left out: {how}"
 
 
 def _calibrated(
@@ -260,6 +260,7 @@ def _calibrated(
             views[stranger].name,
             f"{views[stranger].name} shows another lens than all other pictures do; leave it out if it is of another"
             " camera, of other settings (zoom, focus, cropping), or of another board",
+            "it shows another lens than all other pictures do, or another board",
         )
     covariance = _covariance(fit) * max(apart, 1.0) ** 2
     lens_covariance = covariance[: len(fit.lens), : len(fit.lens)]
@@ -308,6 +309,7 @@ def _consistent(fit: LensFit, views: Sequence[View]) -> None:
             views[worst].name,
             f"the corners fit one lens only to {rms:.2f} px rms, worst {views[worst].name} with {each[worst]:.2f} px;"
             " leave it out if it is blurred or of another camera; otherwise, is the board flat and stiff?",
+            f"its corners are off by {each[worst]:.2f} px rms, half of all by at most {np.median(each):.2f}",
         )
 
 
