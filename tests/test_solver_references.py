@@ -178,7 +178,7 @@ def from_the_roof(survey, seed, beacon_m=0.01, picked_px=0.5):
 
 def test_homographies_and_beacons_are_refined_within_their_priors():
     world = World(reflections=0.0, wrong_ids=0.0, slip=0.0, tilt=0.0)
-    refined, believed = [], []
+    refined = []
     for seed in range(5):
         survey, truth = simulate(load("room"), seed, world)
         seen = from_the_roof(survey, seed)
@@ -188,9 +188,9 @@ def test_homographies_and_beacons_are_refined_within_their_priors():
             roof_cameras=tuple(replace(roof, covariance=None) for roof in seen.roof_cameras),
         )
         refined += nees(solve(seen), truth)
-        believed += nees(solve(exact), truth)
+        believed = solve(exact).notes  # who believes them is told that they do not fit
+        assert any("beacons came out" in note and "homographies" in note for note in believed), believed
     assert 0.5 < np.mean(refined) < 2.0
-    assert np.mean(believed) > 10.0  # who believes them is too sure
 
 
 def test_wheels_of_unequal_size_are_found_within_their_prior():

@@ -16,14 +16,14 @@ import scipy.special
 from ..records import Floats, Map, Survey, Vector3
 from ..typed_json import many_records
 from .bundle import SQUARE
+from .components import beacons_left, moves_left
 from .covariance import frame_covariance
 from .mapping import to_map
 from .panes import outside
 from .placement import segments
-from .problem import BEACON, CAMERA, ODOMETRY, ROOF, STOP, Ints, Problem, anchors, build_problem
+from .problem import BEACON, CAMERA, ROOF, STOP, Ints, Problem, anchors, build_problem
 from .robust import Optimum, optimise
 from .ties import unchecked
-from .wheel_errors import SLIPPED
 
 JOINING = 3  # shared labels that join two parts of a survey, as in placement
 _LEVEL_M = 0.05  # a label is at camera height within this
@@ -135,7 +135,7 @@ def analyse(survey: Survey) -> tuple[Map, Analysis]:
     before = _before(problem)
     state, adjustment = optimum.state, optimum.adjustment
     frame = frame_covariance(adjustment, state)
-    sensors = _sensors(optimum, frame)
+    sensors = _sensors(problem, optimum, frame)
     scale, heading = _shape(optimum, frame)
     # stated sigmas of sightings were replaced by estimates where residuals contradict them: only the rest is a test
     others = sum(s.chi_square for s in sensors if not s.sensor.startswith(_CAMERA))
@@ -255,7 +255,7 @@ def _doubts(sensors: tuple[Scatter, ...]) -> list[str]:
     return found
 
 
-def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:
+def _sensors(asked: Problem, optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:
     """Standard deviations of every kind of measurement, from its residuals and what fitting left of them."""
     problem, state, adjustment = optimum.problem, optimum.state, optimum.adjustment
     used = adjustment.sightings
@@ -274,35 +274,24 @@ def _sensors(optimum: Optimum, frame: Floats | None) -> tuple[Scatter, ...]:
         return tuple(result)
     linear = adjustment.linearise(state, SQUARE)
     m = problem.moves
-    entries = np.concatenate(
-        [
-            STOP * m.before[:, None] + np.arange(3),
-            STOP * m.after[:, None] + np.arange(3),
-            np.tile(len(frame) + np.arange(-ODOMETRY, 0), (len(m.before), 1)),
-        ],
-        axis=1,
-    )
-    wheels = slice(0, len(m.before))  # the rest are motions by other sensors
-    J = np.concatenate([linear.move_before, linear.move_after, linear.move_factor], axis=2)[wheels]
-    good = m.covariance[:, 2, 2] < SLIPPED[2, 2]
+    good = ~m.loosened
     if good.any():
-        fitted = np.einsum("mri,mij,mrj->m", J, frame[entries[:, :, None], entries[:, None, :]], J)
-        stated = float(np.sqrt(np.mean(m.covariance[good, 2, 2])))
-        squares = float((linear.move[wheels][good] ** 2).sum())
+        fitted = np.trace(moves_left(linear, frame, problem), axis1=1, axis2=2)
+        stated = float(np.sqrt(np.mean(m.stated[good, 2, 2])))
+        squares = float((linear.move[: len(good)][good] ** 2).sum())
+        squares *= float(np.mean(m.covariance[good, 2, 2])) / stated**2
         result.append(Scatter("odometry (heading)", stated, "rad", squares, float((3.0 - fitted[good]).sum())))
     if len(linear.roof):
-        entries = adjustment.roof_entries
-        B = np.concatenate([linear.roof_by_stop, linear.roof_by_plane], axis=2)
-        fitted = np.einsum("mri,mij,mrj->m", B, frame[entries[:, :, None], entries[:, None, :]], B)
+        fitted = np.trace(beacons_left(linear, frame, adjustment), axis1=1, axis2=2)
         stated = float(np.sqrt(np.mean(problem.roofs.sigma**2)))
         left = float((2.0 - fitted).sum())
         result.append(Scatter("roof cameras", stated, "px", float((linear.roof**2).sum()), left))
     variance = np.diagonal(frame)
     for name, unit, chosen in _priors(problem):
-        prior = problem.prior_sigma[chosen]
+        prior = asked.prior_sigma[chosen]
         chosen, prior = chosen[prior > 0.0], prior[prior > 0.0]
         if len(chosen):
-            left = float((1.0 - variance[chosen] / prior**2).sum())
+            left = float((1.0 - variance[chosen] / problem.prior_sigma[chosen] ** 2).sum())
             squares = float(((state.frame[chosen] / prior) ** 2).sum())
             result.append(Scatter(name, float(np.sqrt(np.mean(prior**2))), unit, squares, left))
     return tuple(result)

@@ -25,7 +25,11 @@ from .wheel_errors import arc_by_errors, coupling
 
 _POSE_SIGMA = 10.0  # metres and radians: where a stop would be, before anything there is measured
 _NO_MOVES = Moves(
-    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
+    np.zeros(0, np.int64),
+    np.zeros(0, np.int64),
+    np.zeros((0, 3)),
+    *(np.zeros((0, 3, 3)),) * 3,
+    np.zeros(0, np.bool_),
 )
 _LEAST_LEFT = 1e-9  # of a measurement's variance that nothing else tells: below is rounding
 MARGIN_PX = 2.0  # a light nearer to the image's border is not found

@@ -61,8 +61,9 @@ def _looks(problem: Problem, sightings: Sightings) -> list[set[int]]:
 def without_moves(problem: Problem, after: Ints) -> Problem:
     """The problem in which the moves to some stops say nothing."""
     moves = problem.moves
-    covariance = np.where(np.isin(moves.after, after)[:, None, None], LOST, moves.covariance)
-    return replace(problem, moves=replace(moves, covariance=covariance))
+    lost = np.isin(moves.after, after)
+    covariance = np.where(lost[:, None, None], LOST, moves.covariance)
+    return replace(problem, moves=replace(moves, covariance=covariance, loosened=moves.loosened | lost))
 
 
 def lost_note(problem: Problem, state: State, m: int) -> str:

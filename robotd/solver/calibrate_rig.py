@@ -184,11 +184,11 @@ def calibrate_rig(survey: Survey, bounds: Bounds = Bounds(), *, free: bool = Tru
         nominal = problem.R_robot_camera, problem.t_robot_camera
         if lacks := _missing(problem, free):
             raise SolverError("; ".join(lacks))
-        optimum = optimise(problem)
+        optimum = optimise(problem, as_stated=True)
         if optimum.problem.frame != problem.frame or not optimum.placed.all():
             # known labels are hard to match, and legs to join, while cameras look elsewhere than they are thought to
             found, *_ = joint(optimum, (bounds.beacons, bounds.roofs))
-            optimum = optimise(build_problem(_loosened(_at(survey, found), bounds)))
+            optimum = optimise(build_problem(_loosened(_at(survey, found), bounds)), as_stated=True)
         explained = _explained(optimum)
         if explained < _FITS:
             raise SolverError(

@@ -20,7 +20,7 @@ from ..typed_json import many_records
 from .bundle import SQUARE, Adjustment, Loss
 from .mapping import to_map
 from .placement import Placement, ray_tolerance, retriangulate
-from .problem import STOP, Bools, Ints, Motions, Moves, Problem, Roofs, Sightings, State, build_problem
+from .problem import STOP, Bools, Motions, Moves, Problem, Roofs, Sightings, State, build_problem
 from .robust import Optimum, optimise
 from .weights import OUTLIER
 
@@ -224,7 +224,7 @@ def _around_last(problem: Problem) -> Problem:
         problem,
         prior_sigma=prior,
         sightings=s.select(mine[s.label]),
-        moves=_chosen(problem.moves, problem.moves.after == last),
+        moves=problem.moves.select(problem.moves.after == last),
         motions=problem.motions.select(problem.motions.after == last),
         roofs=problem.roofs.select(problem.roofs.stop == last),
     )
@@ -251,8 +251,3 @@ def _merged(old: Sightings, new: Sightings) -> Sightings:
 
 def _joined(old: Arrays, new: Arrays) -> Arrays:
     return type(old)(*(np.concatenate([getattr(old, f.name), getattr(new, f.name)]) for f in fields(old)))
-
-
-def _chosen(moves: Moves, keep: Bools) -> Moves:
-    values: list[Floats | Ints] = [getattr(moves, f.name)[keep] for f in fields(moves)]
-    return Moves(*values)  # type: ignore[arg-type]

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..records import Floats
 from .problem import Bools, Known, Problem
-from .wheel_errors import SLIPPED
 
 _SLIPPING = 0.25  # of the moves, and two, from which known labels are doubted
 _WRONG = 5.0  # standard deviations
@@ -26,7 +25,12 @@ def chosen(known: Known, keep: Bools) -> Known:
 
 def slipped(problem: Problem) -> int:
     """How many moves were loosened because they contradict everything else."""
-    return int(np.count_nonzero(problem.moves.covariance[:, 2, 2] >= SLIPPED[2, 2]))
+    return int(np.count_nonzero(problem.moves.loosened))
+
+
+def slips_often(problem: Problem) -> bool:
+    """Whether more moves were loosened than wheels slip."""
+    return slipped(problem) >= max(2, _SLIPPING * len(problem.moves.before))
 
 
 def contradicted(asked: Problem, found: Problem, points: Floats) -> bool:
@@ -37,7 +41,7 @@ def contradicted(asked: Problem, found: Problem, points: Floats) -> bool:
     if asked.frame != "known labels":
         return False
     left, dropped = len(found.known.label), len(asked.known.label) - len(found.known.label)
-    if slipped(found) >= max(2, _SLIPPING * len(found.moves.before)) or dropped > left:
+    if slips_often(found) or dropped > left:
         return True
     seen = np.isin(asked.known.label, found.sightings.label)
     given, here = asked.known.position[seen], points[asked.known.label[seen]]

@@ -17,10 +17,10 @@ import numpy as np
 
 from ..errors import InputError
 from .known_labels import slipped
-from .problem import CAMERA, ODOMETRY, SIGMA_FLOOR_PX, Problem, build_problem, stops_per_label
+from .problem import CAMERA, ODOMETRY, Problem, build_problem, stops_per_label
 from .readings import CAMERAS, LENSES, NEARLY, Reading, lengths, lenses, nearly, rigs, signs
 from .references import IMPOSSIBLE, MOST_TO_TRY, POSSIBLE, chance
-from .robust import Optimum, optimise
+from .robust import Optimum, optimise, scatter
 
 FITS = 0.5  # share of the survey's sightings below which its calibration or its units are doubted
 FITS_NOT = 0.45  # and below which nothing is placed
@@ -94,21 +94,18 @@ class Strain:
 def strain(optimum: Optimum) -> Strain:
     """How well the survey fits; scatter and calibration are not judged where too little shows."""
     problem = optimum.problem
-    s, moves = problem.sightings, problem.moves
-    stated = np.maximum(problem.columns.sigma[s.source], SIGMA_FLOOR_PX)
-    scatter = float(np.median(s.sigma / stated)) if len(s) else 1.0
     return Strain(
         explained_share(optimum),
-        scatter,
+        scatter(problem),
         slipped(problem),
-        len(moves.before),
+        len(problem.moves.before),
         chance(optimum.adjustment, optimum.state),
     )
 
 
 def misfit(asked: Problem, optimum: Optimum) -> Misfit:
     """Judge how much of a survey its optimum explains, and look for the mistake if that is little."""
-    seen = strain(optimum)
+    seen = strain(optimum.stated or optimum)
     little = f"only {100 * seen.share:.0f} % of the sightings fit any map, so few labels are placed"
     if seen.is_there and len(asked.sightings) <= MOST_TO_TRY:
         found = _best_reading(asked, seen)
@@ -120,6 +117,8 @@ def misfit(asked: Problem, optimum: Optimum) -> Misfit:
                 return Misfit(seen.share, doubt, reading.kind not in (CAMERAS, LENSES))
             text = f"{little}; with {said} {100 * other.share:.0f} % do: check {where}"
             return Misfit(seen.share, text, reading.kind != CAMERAS)
+    if optimum.stated is not None:
+        seen = strain(optimum)
     labels = optimum.adjustment.labels
     heights = zip(optimum.state.points[labels, 2].tolist(), optimum.covariance.points[:, 2, 2].tolist(), strict=True)
     sunken = sum(is_below_floor(z, variance) for z, variance in heights)
@@ -178,7 +177,7 @@ def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
         for reading in chain(signs(survey), rigs(survey)):
             if reading.kind != CAMERAS or seen.share < _MOSTLY:  # exchanged cameras leave no survey that fits
                 yield reading
-    if not seen.scatters and (everything or seen.chance < IMPOSSIBLE):
+    if everything and not seen.scatters:
         yield from lenses(survey)
 
 
@@ -197,9 +196,12 @@ def is_below_floor(z: float, variance: float) -> bool:
 
 
 def strained(optimum: Optimum) -> list[str]:
-    """Sentences on priors that the optimum had to leave far behind, and on cameras whose sightings do not fit."""
+    """Sentences on priors that the optimum had to leave far behind, and on cameras whose sightings do not fit.
+
+    Of priors that were widened the notes speak already.
+    """
     problem, frame = optimum.problem, optimum.state.frame
-    sigma, found = problem.prior_sigma, []
+    sigma, found = problem.prior_sigma, list[str]()
     names = ("scale", "turns", "drift")
     for name, value, one in zip(names, frame[-ODOMETRY:], sigma[-ODOMETRY:], strict=True):
         if one > 0.0 and abs(value) > _STRAINED * one:

@@ -177,14 +177,7 @@ def detach(problem: Problem, placed: Bools) -> Problem:
         problem,
         prior_sigma=prior,
         sightings=problem.sightings.select(placed[problem.sightings.stop]),
-        moves=replace(
-            moves,
-            before=moves.before[keep],
-            after=moves.after[keep],
-            measured=moves.measured[keep],
-            covariance=moves.covariance[keep],
-            by_errors=moves.by_errors[keep],
-        ),
+        moves=moves.select(keep),
         motions=problem.motions.select(placed[problem.motions.after]),
         roofs=problem.roofs.select(seen),
     )

@@ -73,7 +73,8 @@ class Sightings:
 class Moves:
     """Odometry factors: `before`, `after` (M,) stops, `measured` (M, 3), `covariance` (M, 3, 3).
 
-    `by_errors` (M, 3, 3) are derivatives of the measured by the three last entries of the frame vector.
+    `by_errors` (M, 3, 3) are derivatives of the measured by the three last entries of the frame vector. `stated`
+    (M, 3, 3) are the covariances as the survey has them; `loosened` (M,) says which moves count as slipped or lost.
     """
 
     before: Ints
@@ -81,6 +82,12 @@ class Moves:
     measured: Floats
     covariance: Floats
     by_errors: Floats
+    stated: Floats
+    loosened: Bools
+
+    def select(self, keep: Bools) -> Moves:
+        """Some of them."""
+        return Moves(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -414,7 +421,9 @@ def _moves(survey: Survey) -> tuple[Moves, list[str]]:
     index, derivatives = np.array(after, dtype=np.int64), np.array(by_errors).reshape(-1, 3, 3)
     derivatives[:, :, 0] += coupling(survey.priors) * derivatives[:, :, 1]
     covariances = np.array(covariance).reshape(-1, 3, 3)
-    return Moves(index - 1, index, np.array(measured).reshape(-1, 3), covariances, derivatives), notes
+    steady = np.zeros(len(index), dtype=np.bool_)
+    moved = np.array(measured).reshape(-1, 3)
+    return Moves(index - 1, index, moved, covariances, derivatives, covariances, steady), notes
 
 
 def _motions(survey: Survey) -> Motions:

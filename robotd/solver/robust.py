@@ -16,16 +16,18 @@ from ..geometry.transforms import se2_relative
 from ..records import Floats
 from .breaks import torn_moves, without_moves
 from .bundle import SQUARE, Adjustment, Loss, Solution
+from .components import MOST_TO_TRY, judge, remarks, rescaled_known, rescaled_moves, widened
 from .covariance import Covariance, covariance
 from .hypotheses import Hypotheses, behind_glass, hypotheses, in_floor, out_of_glass, support, with_shared
 from .initial import epipolar_moves
-from .known_labels import contradicted, difference, slipped, undecided
+from .known_labels import contradicted, difference, slipped, slips_often, undecided
 from .placement import Placement, at_first_stop, detach, place, ray_tolerance, retriangulate
-from .problem import Bools, Problem, State, stops_per_label
+from .problem import SIGMA_FLOOR_PX, Bools, Problem, State, stops_per_label
 from .references import IMPOSSIBLE, POSSIBLE, agreeing, beacons_disagree, bends, chance
 from .tie_sightings import without_ties
 from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
+from .wheel_errors import slip_covariance
 from .wrong import with_lost_moves, without_known, without_wrong
 
 _REFERENCE = Loss("geman-mcclure", 0.4)  # compares starts: strict enough to tell them apart, slack on the lens
@@ -34,6 +36,9 @@ _ENOUGH = 20  # sightings at a stop, to begin with
 _FEW_DOUBTS = 0.001  # share of sightings not explained, below which labels are not triangulated once more
 _CLEAN = 0.97  # share of sightings explained at which no other start can do better
 _SAME = 0.5  # difference of two starts' costs below which they found the same minimum
+_SCATTERS, _LESS = 1.3, 0.7  # times a stated standard deviation, and of that, from which priors are doubted instead
+_LITTLE = 20.0  # times a prior, so that it holds little
+_ROUNDS = 8  # of widening what the survey states too small
 _BREAKS = 4  # times that moves are looked for which are not the robot's
 _JOINED = 3  # sightings that must fit in addition without them
 _MEDIAN = 2.0 * np.log(2.0)  # of the squared length of a standard normal vector in the plane
@@ -68,9 +73,11 @@ class Optimum:
     sightings take part; `adjustment` is their least-squares problem and `state` its optimum. `placed` (S,) are the
     stops that have a place in the world. `reflected` (N,) are sightings of a label's image in floor or glass.
     `hypotheses` says where else each label may be. `rival` is another optimum of the whole survey
-    that explains it about as well.
+    that explains it about as well. `base` is the problem before anything was found wrong. `stated` is this
+    optimum with all standard deviations as the survey has them, if some had to be widened.
     """
 
+    base: Problem
     problem: Problem
     state: State
     placed: Bools
@@ -82,19 +89,31 @@ class Optimum:
     rival: Rival | None
     iterations: int
     converged: bool
+    stated: Optimum | None = None
 
 
 def optimise(
-    problem: Problem, start: Floats | None = None, grown: Placement | None = None, thorough: bool = True
+    problem: Problem,
+    start: Floats | None = None,
+    grown: Placement | None = None,
+    thorough: bool = True,
+    as_stated: bool = False,
 ) -> Optimum:
     """Find the poses, rig and points that explain the sightings, whatever else is among them.
 
     `start` (S, 3) holds x, y, heading of every stop to begin from; by default those that odometry chains. `grown` is
     tried before all starts: a state near the optimum, for instance that of the same survey without its last stop. If
     not `thorough`, breaks in legs and weak ties are not looked for: enough to say how well a survey fits.
+    If `as_stated`, priors and moves are believed, however little they fit: who calibrates them judges them.
     """
     if not thorough:
         return _from_starts(problem, start, grown, thorough)
+    optimum = _decided(problem, start, grown)
+    return optimum if as_stated else _borne_out(optimum)
+
+
+def _decided(problem: Problem, start: Floats | None, grown: Placement | None) -> Optimum:
+    """The optimum with those outside references that agree with all else."""
     optimum = _optimise(problem, start, grown)
     if problem.frame == "first stop":
         return optimum
@@ -130,11 +149,93 @@ def optimise(
         + ("check their positions and names" if problem.frame == "known labels" else "check their homographies")
     )
     notes = (note, *(text for text in other.problem.notes if text))
-    return replace(other, problem=replace(other.problem, notes=notes))
+    base = replace(other.base, notes=(note, *other.base.notes))
+    return replace(other, base=base, problem=replace(other.problem, notes=notes))
+
+
+def _borne_out(optimum: Optimum) -> Optimum:
+    """The optimum with wider standard deviations of what contradicts the stated ones, and with notes on these."""
+    result = _instead_of_scatter(optimum)
+    judged = judge(result.adjustment, result.state, result.covariance)
+    for _ in range(_ROUNDS):
+        if (wider := widened(result.problem, judged)) is None:
+            break
+        everything = Adjustment(wider, wider.sightings)
+        everything, state, inlier, adjustment, spent, converged = _least_squares(everything, result.state)
+        sure = covariance(adjustment, state)
+        adjustment, state, sure, inlier = without_ties(adjustment, state, sure, inlier)
+        stated = wider.columns.sigma[wider.sightings.source[inlier]]
+        adjustment, state, sure = weighed(adjustment, state, sure, stated)
+        judged = judge(adjustment, state, sure)
+        result = replace(
+            result,
+            problem=everything.problem,
+            state=state,
+            inlier=inlier,
+            adjustment=adjustment,
+            covariance=sure,
+            iterations=result.iterations + spent,
+            converged=converged,
+        )
+    if result is not optimum:
+        everything = Adjustment(result.problem, result.problem.sightings)
+        reflected, found = _elsewhere(everything, result.state)
+        shown = (in_floor(everything, result.state) | reflected) & ~result.inlier
+        problem = with_lost_moves(result.problem, result.state)
+        result = replace(result, problem=problem, reflected=shown, hypotheses=found, stated=optimum)
+    said = remarks(optimum.problem, result.problem, judged)
+    return replace(result, problem=replace(result.problem, notes=(*result.problem.notes, *said))) if said else result
+
+
+def _instead_of_scatter(optimum: Optimum) -> Optimum:
+    """The optimum in which priors and moves give way, if sightings scatter more than stated for their sake alone.
+
+    Sightings that scatter make all else look right. So priors and moves are tried that hold little; where sightings
+    then scatter much less, their noise is what is left, and against it the others are judged.
+    """
+    factor = scatter(optimum.problem)
+    if factor <= _SCATTERS or len(optimum.problem.sightings) > MOST_TO_TRY:
+        return optimum
+    base, prior = optimum.base, optimum.base.prior_sigma
+    known, slipping = base.known, base.moves.covariance + slip_covariance(base.moves.measured)
+    little = replace(
+        base,
+        prior_sigma=_LITTLE * prior,
+        moves=replace(base.moves, covariance=slipping),
+        known=replace(known, sigma=_LITTLE * known.sigma),
+    )
+    free = _from_starts(little, None, None, thorough=False)
+    fewer = np.count_nonzero(free.inlier) < np.count_nonzero(optimum.inlier)
+    if scatter(free.problem) > _LESS * factor or fewer or not free.placed.all():
+        return optimum
+    state, base = free.state, rescaled_moves(base, free.state, free.placed) or base
+    problem = replace(free.problem, prior_sigma=prior, moves=base.moves, known=known)
+    problem = without_wrong(Adjustment(problem, problem.sightings), state)
+    for _ in range(_ROUNDS):
+        adjustment = Adjustment(problem, free.adjustment.sightings)
+        state = adjustment.solve(state, SQUARE, iterations=30, tolerance=1e-4, damping=1e-8).state
+        wider = widened(problem, judge(adjustment, state, covariance(adjustment, state)))
+        if wider is None:
+            break
+        problem = wider
+    vaguer = np.median(problem.known.sigma) / np.median(known.sigma) if len(problem.known.sigma) else 1.0
+    known = replace(known, sigma=known.sigma * vaguer)
+    other = _from_starts(replace(base, prior_sigma=problem.prior_sigma, known=known), None, None)
+    return other if scatter(other.problem) < _LESS * factor else optimum
 
 
 def _optimise(problem: Problem, start: Floats | None, grown: Placement | None) -> Optimum:
     optimum = _from_starts(problem, start, grown)
+    if slips_often(optimum.problem) and (wider := rescaled_moves(problem, optimum.state, optimum.placed)) is not None:
+        other = _from_starts(wider, start, None)
+        steadier = 2 * slipped(other.problem) <= slipped(optimum.problem)
+        if steadier and np.count_nonzero(other.inlier) > 0.98 * np.count_nonzero(optimum.inlier):
+            problem, optimum = wider, other
+    if (vaguer := rescaled_known(problem, optimum.problem, optimum.state)) is not None:
+        other = _from_starts(vaguer, start, None)
+        dropped = len(problem.known.label) - len(optimum.problem.known.label)
+        if 2 * (len(problem.known.label) - len(other.problem.known.label)) <= dropped:
+            problem, optimum = vaguer, other
     for _ in range(_BREAKS):
         torn = torn_moves(optimum.problem, optimum.inlier)
         if len(torn) == 0:
@@ -149,7 +250,7 @@ def _optimise(problem: Problem, start: Floats | None, grown: Placement | None) -
 
 def _from_starts(problem: Problem, start: Floats | None, grown: Placement | None, thorough: bool = True) -> Optimum:
     problem, placement, solution, iterations = _best_start(problem, start, grown)
-    return _finish(detach(problem, placement.placed), placement.placed, solution.state, iterations, thorough)
+    return _finish(problem, placement.placed, solution.state, iterations, thorough)
 
 
 def _best_start(
@@ -228,8 +329,8 @@ def _weights(adjustment: Adjustment, state: State) -> Floats:
     return _REFERENCE((adjustment.residuals(state, _REFERENCE).residual ** 2).sum(axis=1))[1]
 
 
-def _finish(problem: Problem, placed: Bools, state: State, iterations: int, thorough: bool) -> Optimum:
-    stated = problem.sightings.sigma
+def _finish(base: Problem, placed: Bools, state: State, iterations: int, thorough: bool) -> Optimum:
+    problem = detach(base, placed)
     everything = Adjustment(problem, problem.sightings)
     factor = _scatter(everything, state)
     if factor != 1.0:
@@ -260,18 +361,13 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int, thor
         problem = _rescaled(problem, factor)
         everything = Adjustment(problem, problem.sightings)
     adjustment, state, sure = weighed(adjustment, state, sure, problem.columns.sigma[problem.sightings.source[inlier]])
-    kept = state
-    state, reflected, found = out_of_glass(everything, state)
-    if state is not kept:  # a label that only now seems to be its image stays where it was adjusted
-        state = kept
-        found = hypotheses(everything, state, reflected)
-    found = with_shared(everything, state, found, reflected)
+    reflected, found = _elsewhere(everything, state)
     problem = with_lost_moves(problem, state)
-    factor = float(np.median(problem.sightings.sigma / stated)) if len(stated) else 1.0
-    if factor > 1.0:
+    if (factor := scatter(problem)) > 1.0:
         note = f"sightings scatter {factor:.1f} times as much as their sigma_px says; uncertainties were scaled"
         problem = replace(problem, notes=(*problem.notes, note))
     return Optimum(
+        base,
         problem,
         state,
         placed,
@@ -284,6 +380,14 @@ def _finish(problem: Problem, placed: Bools, state: State, iterations: int, thor
         iterations,
         converged,
     )
+
+
+def _elsewhere(everything: Adjustment, state: State) -> tuple[Bools, Hypotheses]:
+    """Which sightings (N,) are of images in glass, and where else labels may be, given the adjusted state."""
+    other, reflected, found = out_of_glass(everything, state)
+    if other is not state:  # a label that only now seems to be its image stays where it was adjusted
+        found = hypotheses(everything, state, reflected)
+    return reflected, with_shared(everything, state, found, reflected)
 
 
 def _least_squares(everything: Adjustment, state: State) -> tuple[Adjustment, State, Bools, Adjustment, int, bool]:
@@ -349,6 +453,13 @@ def _excess(adjustment: Adjustment, state: State, sure: Covariance) -> float:
     found = float((adjustment.residuals(state, SQUARE).residual ** 2).sum())
     ratio = found / expected
     return float(np.sqrt(ratio)) if ratio > 1.0 + 3.0 * np.sqrt(2.0 / expected) else 1.0
+
+
+def scatter(problem: Problem) -> float:
+    """By how much the sightings' standard deviations were multiplied because they scatter more."""
+    s = problem.sightings
+    stated = np.maximum(problem.columns.sigma[s.source], SIGMA_FLOOR_PX)
+    return float(np.median(s.sigma / stated)) if len(s) else 1.0
 
 
 def _rescaled(problem: Problem, factor: float) -> Problem:

@@ -10,7 +10,7 @@ from .breaks import lost_note, without_moves
 from .bundle import SQUARE, Adjustment
 from .known_labels import chosen
 from .problem import Ints, Problem, State, anchors
-from .wheel_errors import LOST, SLIPPED, slip_covariance
+from .wheel_errors import LOST, slip_covariance
 
 _SLIP = 20.0  # squared whitened residual of a move, 3 degrees of freedom: one good move in 6000 exceeds it
 _WRONG_KNOWN = 25.0
@@ -37,8 +37,8 @@ def without_wrong(everything: Adjustment, state: State) -> Problem:
         covariance_ = np.where(
             slipped[:, None, None], moves.covariance + slip_covariance(moves.measured), moves.covariance
         )
-        moves = replace(moves, covariance=covariance_)
-        lost = slipped & (problem.moves.covariance[:, 2, 2] >= SLIPPED[2, 2])
+        moves = replace(moves, covariance=covariance_, loosened=moves.loosened | slipped)
+        lost = slipped & problem.moves.loosened
         moves = without_moves(replace(problem, moves=moves), moves.after[lost]).moves
         for m in np.flatnonzero(slipped & ~lost):
             stop = problem.survey.stops[moves.after[m]]
