@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotd.geometry.transforms import rotation_matrix, rotation_vector
+from robotd.geometry.transforms import heading_matrix, rotation_matrix, rotation_vector, se2_inverse
 from robotd.records import KnownLabel, Transform
 from robotd.solver import solve
 from robotd.solver.readings import with_moves, with_pixels
@@ -69,6 +69,88 @@ def test_one_camera_with_pictures_of_another_size_is_named_and_costs_only_its_la
         m.label for m in result.labels if m.position and np.linalg.norm(np.subtract(m.position, truth[m.label])) > 0.05
     ]
     assert not wrong
+
+
+def with_ways(survey, change):
+    """The survey with its moves changed as an (M, 3) array."""
+    moves = [stop.move for stop in survey.stops[1:]]
+    ways = change(np.array([[m.dx, m.dy, m.dheading] for m in moves]))
+    moves = [
+        replace(m, dx=x, dy=y, dheading=t, by_errors=None) for m, (x, y, t) in zip(moves, ways.tolist(), strict=True)
+    ]
+    stops = [replace(stop, move=move) for stop, move in zip(survey.stops[1:], moves, strict=True)]
+    return replace(survey, stops=(survey.stops[0], *stops))
+
+
+def in_first_axes(ways):
+    heading = np.concatenate([[0.0], np.cumsum(ways[:-1, 2])])
+    return np.column_stack([(heading_matrix(heading) @ ways[:, :2, None])[:, :, 0], ways[:, 2]])
+
+
+def in_own_axes(ways):
+    return np.column_stack([(heading_matrix(-ways[:, 2]) @ ways[:, :2, None])[:, :, 0], ways[:, 2]])
+
+
+@pytest.mark.parametrize("store", ["room", "warehouse"])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda w: np.roll(w, -1, axis=0), "the moves one stop later"),
+        (lambda w: np.roll(w, 1, axis=0), "the moves one stop earlier"),
+        (in_first_axes, "in the axes of each leg's first stop"),
+        (in_own_axes, "in the axes of the robot after them"),
+        (se2_inverse, "back to the stop before"),
+    ],
+    ids=["early", "late", "world axes", "own axes", "backwards"],
+)
+def test_moves_of_other_stops_or_in_other_axes_are_named_and_nothing_is_placed(store, change, said):
+    survey, _ = survey_of(store)
+    result = solve(with_ways(survey, change))
+    assert any(said in note for note in result.notes), result.notes
+    assert not any(label.status == "placed" for label in result.labels)
+
+
+def test_a_camera_that_stands_a_metre_from_where_it_should_costs_its_sightings_alone():
+    survey, truth = survey_of("warehouse")
+
+    def moved(camera):
+        mount = camera.T_robot_camera
+        return replace(camera, T_robot_camera=replace(mount, translation=(1.0, *mount.translation[1:])))
+
+    cameras = tuple(moved(c) if c.name == "left" else c for c in survey.rig.cameras)
+    result = solve(replace(survey, rig=replace(survey.rig, cameras=cameras)))
+    assert any("camera left's sightings" in note and "not used" in note for note in result.notes), result.notes
+    errors = [np.linalg.norm(np.subtract(m.position, truth[m.label])) for m in result.labels if m.status == "placed"]
+    assert len(errors) > 0.6 * len(truth)
+    assert max(errors) < 0.1
+
+
+def test_sightings_of_two_stops_that_were_exchanged_are_named_and_not_used():
+    survey, truth = survey_of("warehouse")
+    stops = list(survey.stops)
+    stops[4] = replace(stops[4], sightings=survey.stops[5].sightings)
+    stops[5] = replace(stops[5], sightings=survey.stops[4].sightings)
+    result = solve(replace(survey, stops=tuple(stops)))
+    wrong = [
+        m.label
+        for m in result.labels
+        if m.status == "placed" and np.linalg.norm(np.subtract(m.position, truth[m.label])) > 0.1
+    ]
+    assert not wrong
+    assert any("leg/stop 1/5" in note or "leg 1 stop 5" in note for note in result.notes), result.notes
+
+
+@pytest.mark.parametrize("pair", [("left", "right"), ("front", "rear")])
+def test_exchanged_cameras_are_named_and_nothing_is_placed(pair):
+    survey, _ = survey_of("warehouse")
+    other = dict(zip(pair, pair[::-1], strict=True))
+    stops = [
+        replace(stop, sightings=tuple(replace(s, camera=other.get(s.camera, s.camera)) for s in stop.sightings))
+        for stop in survey.stops
+    ]
+    result = solve(replace(survey, stops=tuple(stops)))
+    assert any(f"cameras {pair[0]} and {pair[1]} exchanged" in note for note in result.notes), result.notes
+    assert not any(label.status == "placed" for label in result.labels)
 
 
 def measured(truth, labels, change):

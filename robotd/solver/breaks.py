@@ -16,6 +16,7 @@ from ..geometry.transforms import se2_relative, wrap_angle
 from .problem import Bools, Ints, Problem, Sightings, State
 from .wheel_errors import LOST
 
+_CARRIED_M, _CARRIED_RAD = 0.1, 0.3  # beyond what a wheel slips
 _NEAR = 3  # stops to either side of a move
 _LEAST = 3  # labels that both sides saw: as many as it takes to join them
 _TORN = 0.5  # of these, on which the sides agree
@@ -66,14 +67,29 @@ def without_moves(problem: Problem, after: Ints) -> Problem:
     return replace(problem, moves=replace(moves, covariance=covariance, loosened=moves.loosened | lost))
 
 
-def lost_note(problem: Problem, state: State, m: int) -> str:
-    """A sentence on a move that was not used: by how much it is wrong."""
+def carried(problem: Problem, state: State) -> Ints:
+    """Moves that were not used and lead elsewhere by more than a wheel ever slipped."""
+    lost = np.flatnonzero(problem.moves.covariance[:, 2, 2] >= LOST[2, 2])
+    off = np.array([_off(problem, state, m) for m in lost.tolist()]).reshape(-1, 2)
+    return np.asarray(lost[(off[:, 0] > _CARRIED_M) | (off[:, 1] > _CARRIED_RAD)])
+
+
+def _off(problem: Problem, state: State, m: int) -> tuple[float, float]:
+    """By how far, in metres and radians, a move is wrong."""
     moves, poses = problem.moves, problem.stop_entries(state)[:, :3]
-    stop = problem.survey.stops[moves.after[m]]
     true = se2_relative(poses[moves.before[m]], poses[moves.after[m]])
     far = float(np.hypot(*(true - moves.measured[m])[:2]))
-    turn = float(np.degrees(abs(wrap_angle(float(true[2] - moves.measured[m][2])))))
+    return far, float(abs(wrap_angle(float(true[2] - moves.measured[m][2]))))
+
+
+def lost_note(problem: Problem, state: State, m: int) -> str:
+    """A sentence on a move that was not used: by how much it is wrong."""
+    stop = problem.survey.stops[problem.moves.after[m]]
+    far, turn = _off(problem, state, m)
+    why = ", more than wheels slip; it was not used (was the robot pushed or carried?)"
+    if far <= _CARRIED_M and turn <= _CARRIED_RAD:
+        why = ", more than its covariance says; it was not used (did a wheel slip?)"
     return (
-        f"leg {stop.leg} stop {stop.stop}: the move to it is {far:.2g} m and {turn:.2g} degrees from what the "
-        "sightings say, more than wheels slip; it was not used (was the robot pushed or carried?)"
+        f"leg {stop.leg} stop {stop.stop}: the move to it is {far:.2g} m and {np.degrees(turn):.2g} degrees from what "
+        f"the sightings say{why}"
     )

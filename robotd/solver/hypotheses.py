@@ -27,6 +27,7 @@ _CHANCE = 0.25  # share of an image's support with which the label itself stands
 _TWO = 2.5  # support that three sightings have and two have not
 _TIE = 0.75  # of one sighting, and of a position's support: with less of a lead, another position is as likely
 _TWO_SIGHTINGS = 1.5  # support that two have and one has not
+_TWICE = 0.5  # of a position's support, from which three sightings that agree elsewhere are no chance: it was moved
 _EXCHANGED = 0.4  # share of a position's support from which another one is no stray wrong name
 _FEW_STOPS = 3  # that agree, up to which other sightings may be right and one of these wrong
 
@@ -52,6 +53,7 @@ class Hypotheses:
         for points, rival_gain in ((self.rivals, self.rival_gain), *self.shared):
             point, support_ = points[label], rival_gain[label]
             as_likely = gain - support_ < _TIE and support_ > _TIE * gain
+            as_likely |= points is self.rivals and support_ > max(_TWO, _TWICE * gain)
             as_likely |= points is self.rivals and self.chance is not None and bool(self.chance[label])
             if np.isfinite(point[0]) and as_likely and all(np.linalg.norm(point - p) > _APART_M for p in result):
                 result.append(point)

@@ -100,7 +100,7 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
     residual_px = linear.residual * problem.sightings.sigma[:, None]
     inlier = optimum.inlier
     used = residual_px[inlier]
-    notes = [*problem.notes]
+    notes = [*((doubt.text,) if doubt.text is not None else ()), *problem.notes]
     lost = [f"{s.leg}/{s.stop}" for s, ok in zip(problem.survey.stops, optimum.placed, strict=True) if not ok]
     if lost:
         why = "share too few labels with the rest to be joined to it"
@@ -111,8 +111,6 @@ def to_map(asked: Problem, optimum: Optimum) -> Map:
                 "make longer legs",
             )
         notes.append(f"leg/stop {', '.join(lost)} {why}; their poses are in their own odometry frame; {mend}")
-    if doubt.text is not None:
-        notes.append(doubt.text)
     if (caution := on_a_line(problem)) is not None:
         notes.append(caution)
     notes += strained(optimum)
@@ -147,6 +145,7 @@ class _Tally:
     """
 
     asked_stops: list[int]
+    joined_stops: list[int]
     stops: list[int]
     inliers: list[int]
     agreeing_stops: list[int]
@@ -184,6 +183,7 @@ def _tally(asked: Problem, optimum: Optimum) -> _Tally:
 
     return _Tally(
         asked_stops=stops(asked.sightings),
+        joined_stops=stops(asked.sightings.select(optimum.placed[asked.sightings.stop])),
         stops=stops(s),
         inliers=inliers.tolist(),
         agreeing_stops=stops(s.select(inlier)),
@@ -224,8 +224,10 @@ def _label(asked: Problem, optimum: Optimum, tally: _Tally, i: int, count: int, 
         return unplaced("every sighting lies beyond the lens model's valid radius; map it from another stop")
     if tally.asked_stops[i] == 1:
         return unplaced("seen from one stop only; map it from a second stop")
-    if tally.stops[i] < 2:
+    if tally.stops[i] < 2 and tally.asked_stops[i] > tally.joined_stops[i]:
         return unplaced("seen only from stops that could not be joined to the map; map it together with mapped labels")
+    if tally.stops[i] < 2:
+        return unplaced("most of its sightings are of a camera or stop that fits nothing else; see the map's notes")
     if tied := optimum.hypotheses.tied(i):
         return _ambiguous(optimum, i, label, count, inliers, tied)
     if covariance is None:

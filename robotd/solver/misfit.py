@@ -16,17 +16,18 @@ from itertools import chain
 import numpy as np
 
 from ..errors import InputError
+from .breaks import carried
 from .known_labels import slipped
-from .problem import CAMERA, ODOMETRY, Problem, build_problem, stops_per_label
-from .readings import CAMERAS, LENSES, NEARLY, Reading, lengths, lenses, nearly, rigs, signs
+from .problem import CAMERA, ODOMETRY, Problem, build_problem
+from .readings import CAMERAS, LENSES, NEARLY, Reading, lengths, lenses, nearly, orders, rigs, signs
 from .references import IMPOSSIBLE, MOST_TO_TRY, POSSIBLE, chance
 from .robust import Optimum, optimise, scatter
+from .strangers import ALONE, LEAST_LIGHTS, TOGETHER, shares
 
 FITS = 0.5  # share of the survey's sightings below which its calibration or its units are doubted
 FITS_NOT = 0.45  # and below which nothing is placed
 _UNSURE = 0.8  # share below which the survey is doubted: a third of wrong sightings is possible, but rare
 _MOSTLY = 0.9  # share below which sightings that scatter are doubted
-_LEAST_LIGHTS = 20  # to say so
 _CLEARLY_BETTER = 0.25  # of that share, to blame two cameras or anything else
 _RATHER_BETTER = 0.15  # to blame moves, if then nearly all fit
 _NEARLY_ALL = 0.9
@@ -37,7 +38,6 @@ _MOSTLY_SLIPPED, _MANY_SLIPPED = 0.8, 3  # of the moves from which nothing is pl
 _SUNKEN_M = 0.05  # below the floor, that slopes and steps explain
 _MANY_SUNKEN, _SUNKEN_SHARE = 3, 0.15  # labels, and of all labels, from which heights are doubted
 _STRAINED = 4.0  # standard deviations, of one value; of a root mean square over a rig half of it
-_ALONE = 0.5  # share of one camera's sightings, where those of the others fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +54,18 @@ class Strain:
     """How well a survey fits its optimum.
 
     `share` of the sightings that the map explains, by how much they `scatter` more than they should, how many of the
-    `moves` count as `slipped`, and the `chance` that rig, lenses and wheels are so far from what the priors say.
+    `moves` count as `slipped` and how many of these were left out because the robot seems to have been `carried`, the
+    `chance` that rig, lenses and wheels are so far from what the priors say, and whether sightings of some
+    cameras are `strange`: they do not fit where those of others do.
     """
 
     share: float
     scatter: float
     slipped: int
+    carried: int
     moves: int
     chance: float
+    strange: bool
 
     @property
     def scatters(self) -> bool:
@@ -76,7 +80,7 @@ class Strain:
     @property
     def is_there(self) -> bool:
         """Whether the survey is doubtful."""
-        return self.share < _UNSURE or self.scatters or self.slips or self.chance < IMPOSSIBLE
+        return self.share < _UNSURE or self.scatters or self.slips or self.carried > 0 or self.chance < IMPOSSIBLE
 
     def is_relieved(self, other: Strain) -> bool:
         """Whether another reading of the survey has none of this strain."""
@@ -86,7 +90,8 @@ class Strain:
             (not self.scatters or other.scatter < _SCATTERS_NOT)
             and (not self.slips or not other.slips)
             and (self.chance >= IMPOSSIBLE or other.chance > POSSIBLE)
-            and (self.scatters or self.slips or self.chance < IMPOSSIBLE)
+            and (not self.carried or not other.carried)
+            and (self.scatters or self.slips or self.carried > 0 or self.chance < IMPOSSIBLE)
             and other.share > min(_UNSURE, self.share + _RATHER_BETTER)
         )
 
@@ -98,9 +103,18 @@ def strain(optimum: Optimum) -> Strain:
         explained_share(optimum),
         scatter(problem),
         slipped(problem),
+        len(carried(problem, optimum.state)),
         len(problem.moves.before),
         chance(optimum.adjustment, optimum.state),
+        _strange(optimum),
     )
+
+
+def _strange(optimum: Optimum) -> bool:
+    problem = optimum.problem
+    share, total = shares(problem, optimum.inlier | optimum.reflected, problem.sightings.camera, len(problem.cameras))
+    share = share[total >= LEAST_LIGHTS]
+    return len(share) > 1 and bool(share.min() < ALONE and share.max() > TOGETHER)
 
 
 def misfit(asked: Problem, optimum: Optimum) -> Misfit:
@@ -116,7 +130,7 @@ def misfit(asked: Problem, optimum: Optimum) -> Misfit:
                 doubt = f"the survey contradicts itself ({_complaints(seen)}); with {said} it does not: check {where}"
                 return Misfit(seen.share, doubt, reading.kind not in (CAMERAS, LENSES))
             text = f"{little}; with {said} {100 * other.share:.0f} % do: check {where}"
-            return Misfit(seen.share, text, reading.kind != CAMERAS)
+            return Misfit(seen.share, text, True)
     if optimum.stated is not None:
         seen = strain(optimum)
     labels = optimum.adjustment.labels
@@ -130,11 +144,17 @@ def misfit(asked: Problem, optimum: Optimum) -> Misfit:
             f"only {100 * seen.share:.0f} % of the sightings fit, and these scatter {seen.scatter:.1f} times too much"
         )
         return Misfit(seen.share, f"{text}: check the lenses' distortion and the pictures' size", True)
-    if seen.slipped >= max(_MANY_SLIPPED, _MOSTLY_SLIPPED * seen.moves):
+    if seen.slipped >= max(_MANY_SLIPPED, _MOSTLY_SLIPPED * seen.moves) or seen.carried >= max(
+        2, _SLIPPING * seen.moves
+    ):
         text = f"{seen.slipped} of {seen.moves} moves are not what cameras saw, so size and axes are doubtful"
         return Misfit(seen.share, f"{text}: check the moves, and where the cameras look on the robot", True)
+    if seen.strange:
+        text = f"only {100 * seen.share:.0f} % of the sightings fit, of some cameras hardly any"
+        return Misfit(seen.share, f"{text}: check the lenses, the pictures' size and which camera is which", True)
     if seen.share >= FITS:
-        return Misfit(seen.share, None, False)
+        text = f"only {100 * seen.share:.0f} % of the sightings fit; a label that two stops saw may be wrong by chance"
+        return Misfit(seen.share, text if seen.share < _UNSURE else None, False)
     what = "the rig (which camera is which, metres, radians), the labels' ids and the moves' units"
     return Misfit(seen.share, f"{little}; check {what}", False)
 
@@ -168,13 +188,13 @@ def _merit(strain: Strain) -> float:
 def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
     """Those that could explain such a strain."""
     survey = asked.survey
-    everything = seen.share < FITS or seen.slips or seen.scatters
+    everything = seen.share < FITS or seen.slips or seen.carried > 0 or seen.scatters or seen.strange
     if seen.scatters:
         yield from lenses(survey)
     if asked.frame == "first stop":
         yield from nearly(survey) if seen.share >= _UNSURE else lengths(survey)
     if everything or seen.share < 0.5 * (FITS + _MOSTLY):
-        for reading in chain(signs(survey), rigs(survey)):
+        for reading in chain(signs(survey), orders(survey), rigs(survey)):
             if reading.kind != CAMERAS or seen.share < _MOSTLY:  # exchanged cameras leave no survey that fits
                 yield reading
     if everything and not seen.scatters:
@@ -183,7 +203,7 @@ def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
 
 def _complaints(seen: Strain) -> str:
     said = []
-    if seen.slips:
+    if seen.slips or seen.carried:
         said.append(f"{seen.slipped} of {seen.moves} moves are not what cameras saw")
     if seen.chance < IMPOSSIBLE:
         said.append("rig, lenses and wheels would all have to be far off their calibration")
@@ -219,32 +239,18 @@ def strained(optimum: Optimum) -> list[str]:
                 f"camera {camera.name} came out {size:.1f} times as far from its calibration as its priors allow; "
                 "calibrate the rig"
             )
-    shares = [explained_share(optimum, number) for number in range(len(problem.cameras))]
-    for number, camera in enumerate(problem.cameras):
-        others = [share for k, share in enumerate(shares) if k != number]
-        if shares[number] < _ALONE and others and min(others) > _UNSURE:
-            found.append(
-                f"of camera {camera.name}'s sightings only {100 * shares[number]:.0f} % fit, of the others' "
-                f"{100 * min(others):.0f} % or more; check its lens, its pictures' size and where it looks"
-            )
     return found
 
 
-def explained_share(optimum: Optimum, camera: int | None = None) -> float:
+def explained_share(optimum: Optimum) -> float:
     """Share of the lights that the map explains, among those of labels that two stops or more saw.
 
-    Of rival sightings one is right; what lies in glass or floor is explained too. Too few sightings say nothing. Of
-    one camera's alone, if it is given.
+    What lies in glass or floor is explained too. Too few sightings say nothing.
     """
-    problem, s = optimum.problem, optimum.problem.sightings
-    seen = stops_per_label(s.label, s.stop, len(problem.labels))[s.label] >= 2
-    if camera is not None:
-        seen &= s.camera == camera
-    lights = np.bincount(s.rival[seen]) > 0
-    if np.count_nonzero(lights) < _LEAST_LIGHTS:
-        return 1.0
-    fits = np.bincount(s.rival[seen & (optimum.inlier | optimum.reflected)], minlength=len(lights)) > 0
-    return float(np.count_nonzero(fits) / np.count_nonzero(lights))
+    problem = optimum.problem
+    everyone = np.zeros(len(problem.sightings), dtype=np.int64)
+    share, total = shares(problem, optimum.inlier | optimum.reflected, everyone, 1)
+    return float(share[0]) if total[0] >= LEAST_LIGHTS else 1.0
 
 
 def _where(reading: Reading) -> str:

@@ -9,7 +9,16 @@ from itertools import combinations
 
 import numpy as np
 
-from ..geometry.transforms import invert_rigid, rotation_matrix, transform_matrix, transform_record
+from ..geometry.transforms import (
+    heading_matrix,
+    invert_rigid,
+    rotation_matrix,
+    se2_inverse,
+    se2_relative,
+    transform_matrix,
+    transform_record,
+    wrap_angle,
+)
 from ..path_error import as_matrix3
 from ..records import Floats, Move, Sighting, Survey
 from .robust import Optimum
@@ -63,6 +72,62 @@ def signs(survey: Survey) -> Iterator[Reading]:
     yield Reading(WAYS, "turns of the moves counted clockwise", with_moves(survey, 1.0, 1.0, -1.0))
     yield Reading(WAYS, "y of the moves to the right", with_moves(survey, 1.0, -1.0, 1.0))
     yield Reading(WAYS, "y of the moves to the right and turns clockwise", with_moves(survey, 1.0, -1.0, -1.0))
+
+
+def orders(survey: Survey) -> Iterator[Reading]:
+    """Moves of other stops, or in other axes than those of the robot before."""
+    yield Reading(WAYS, "the moves one stop later", _shifted(survey, 1))
+    yield Reading(WAYS, "the moves one stop earlier", _shifted(survey, -1))
+    yield Reading(WAYS, "the moves read as in the axes of each leg's first stop", _with_ways(survey, _from_first))
+    yield Reading(WAYS, "the moves read as in the axes of the robot after them", _with_ways(survey, _from_after))
+    yield Reading(WAYS, "the moves read as back to the stop before", _with_ways(survey, _from_inverse))
+    yield Reading(WAYS, "the moves read as since each leg's first stop", _with_ways(survey, _from_sums))
+
+
+def _from_first(ways: Floats) -> Floats:
+    heading = np.concatenate([[0.0], np.cumsum(ways[:-1, 2])])
+    along = heading_matrix(heading).transpose(0, 2, 1) @ ways[:, :2, None]
+    return np.column_stack([along[:, :, 0], ways[:, 2]])
+
+
+def _from_after(ways: Floats) -> Floats:
+    return np.column_stack([(heading_matrix(ways[:, 2]) @ ways[:, :2, None])[:, :, 0], ways[:, 2]])
+
+
+def _from_inverse(ways: Floats) -> Floats:
+    return se2_inverse(ways)
+
+
+def _from_sums(ways: Floats) -> Floats:
+    return se2_relative(np.vstack([np.zeros(3), ways[:-1]]), ways)
+
+
+def _with_ways(survey: Survey, change: Callable[[Floats], Floats]) -> Survey:
+    """The survey with the moves of each leg changed as (M, 3) arrays."""
+    stops = list(survey.stops)
+    for leg in sorted({stop.leg for stop in stops}):
+        mine = [k for k, stop in enumerate(stops) if stop.leg == leg and stop.move is not None]
+        moves = [move for k in mine if (move := stops[k].move) is not None]
+        if not moves:
+            continue
+        for k, move, (x, y, turn) in zip(
+            mine, moves, change(np.array([[m.dx, m.dy, m.dheading] for m in moves])).tolist(), strict=True
+        ):
+            stops[k] = replace(stops[k], move=Move(x, y, float(wrap_angle(turn)), move.covariance))
+    return replace(survey, stops=tuple(stops))
+
+
+def _shifted(survey: Survey, by: int) -> Survey:
+    """The survey with each leg's moves at later or earlier stops; the one that is missing then says nothing."""
+    stops = list(survey.stops)
+    nothing = Move(0.0, 0.0, 0.0, ((1e4, 0.0, 0.0), (0.0, 1e4, 0.0), (0.0, 0.0, 1e4)))
+    for leg in sorted({stop.leg for stop in stops}):
+        mine = [k for k, stop in enumerate(stops) if stop.leg == leg and stop.move is not None]
+        moves = [stops[k].move for k in mine]
+        moved = [nothing, *moves[:-1]] if by > 0 else [*moves[1:], nothing]
+        for k, move in zip(mine, moved, strict=True):
+            stops[k] = replace(stops[k], move=move)
+    return replace(survey, stops=tuple(stops))
 
 
 def rigs(survey: Survey) -> Iterator[Reading]:

@@ -24,6 +24,7 @@ from .known_labels import contradicted, difference, slipped, slips_often, undeci
 from .placement import Placement, at_first_stop, detach, place, ray_tolerance, retriangulate
 from .problem import SIGMA_FLOOR_PX, Bools, Problem, State, stops_per_label
 from .references import IMPOSSIBLE, POSSIBLE, agreeing, beacons_disagree, bends, chance
+from .strangers import without_strangers
 from .tie_sightings import without_ties
 from .ties import Rival, doubted
 from .weights import OUTLIER, weighed
@@ -62,6 +63,7 @@ _SCHEDULES = (
         False, 0.3, (Loss("cauchy", 25.0, width=2.0), Loss("cauchy", 7.5, width=2.0), Loss("cauchy", 2.5, width=2.0))
     ),
 )
+_TRIED = 2  # of them, where only how well a survey fits is asked
 _TAIL = (Loss("geman-mcclure", 1.0), Loss("geman-mcclure", 1.0), _REFERENCE)
 
 
@@ -109,6 +111,9 @@ def optimise(
     if not thorough:
         return _from_starts(problem, start, grown, thorough)
     optimum = _decided(problem, start, grown)
+    fewer = without_strangers(problem, optimum.problem, optimum.inlier | optimum.reflected)
+    if fewer is not None:
+        optimum = _decided(fewer, start, None)
     return optimum if as_stated else _borne_out(optimum)
 
 
@@ -249,12 +254,12 @@ def _optimise(problem: Problem, start: Floats | None, grown: Placement | None) -
 
 
 def _from_starts(problem: Problem, start: Floats | None, grown: Placement | None, thorough: bool = True) -> Optimum:
-    problem, placement, solution, iterations = _best_start(problem, start, grown)
+    problem, placement, solution, iterations = _best_start(problem, start, grown, thorough)
     return _finish(problem, placement.placed, solution.state, iterations, thorough)
 
 
 def _best_start(
-    problem: Problem, start: Floats | None, grown: Placement | None
+    problem: Problem, start: Floats | None, grown: Placement | None, thorough: bool
 ) -> tuple[Problem, Placement, Solution, int]:
     best: tuple[float, Placement, Solution] | None = None
     iterations = 0
@@ -262,7 +267,8 @@ def _best_start(
     if start is not None:
         guess = se2_relative(start[problem.moves.before], start[problem.moves.after])
     few = _thinned(problem)
-    for schedule in (None, *_SCHEDULES) if grown is not None else _SCHEDULES:
+    schedules = _SCHEDULES if thorough else _SCHEDULES[:_TRIED]
+    for schedule in (None, *schedules) if grown is not None else schedules:
         if schedule is None:
             assert grown is not None
             placement = grown
