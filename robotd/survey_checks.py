@@ -27,6 +27,8 @@ FARTHEST_LABEL_M = 2000.0
 HIGHEST_LABEL_M = 50.0
 LONGEST_MOVE_M = 500.0
 WIDEST_PRIOR = {"tilt_rad": 0.5, "camera_rotation_rad": 1.0, "camera_translation_m": 2.0, "beacon_m": 1.0}
+LOWEST_CAMERA_M, WIDEST_ROBOT_M, FINEST_KNOWN_M = 0.005, 1.0, 1e-4  # beyond these a map says what it was told
+CAREFUL_PRIOR = {"tilt_rad": 0.1, "camera_rotation_rad": 0.2, "camera_translation_m": 0.1, "odometry_scale": 0.5}
 FARTHEST_M = 1e8  # of any coordinate: maps of countries are smaller, and its square is a number still
 FULL_TURN = 2.0 * np.pi + 1e-9
 METRES, RADIANS = "metres; are these millimetres?", "radians; are these degrees?"
@@ -135,6 +137,42 @@ def check_units(survey: Survey, problems: Problems) -> None:
             if stop.move.by_errors is not None:
                 largest = max(abs(value) for row in stop.move.by_errors for value in row)
                 _within(largest, LONGEST_MOVE_M, f"{path}.by_errors", METRES, problems)
+
+
+def oddities(survey: Survey) -> list[str]:
+    """Sentences on what is possible, and so seldom meant that a map should say it: heights, places, ids, exactness."""
+    found, cameras, priors = [], survey.rig.cameras, survey.priors
+    low = [c.name for c in cameras if c.T_robot_camera.translation[2] <= LOWEST_CAMERA_M]
+    if low:
+        found.append(
+            f"camera {', '.join(low)} stands on the floor or below it (T_robot_camera.translation[2]); labels' heights "
+            "count from the floor only if the cameras' do"
+        )
+    aside = [c.name for c in cameras if np.hypot(*c.T_robot_camera.translation[:2]) > WIDEST_ROBOT_M]
+    if aside:
+        found.append(
+            f"camera {', '.join(aside)} stands more than {WIDEST_ROBOT_M:g} m from the robot's middle: metres?"
+        )
+    for name, most in CAREFUL_PRIOR.items():
+        if (value := getattr(priors, name)) > most:
+            found.append(f"priors.{name} is {value:g}, more than {most:g}, which hardly holds anything: another unit?")
+    exact = [k.label for k in survey.known_labels if k.sigma_m < FINEST_KNOWN_M]
+    if exact:
+        found.append(
+            f"sigma_m of known label {_some(exact)} is below {1e3 * FINEST_KNOWN_M:g} mm, which nobody measures; is it "
+            "squared, or in another unit?"
+        )
+    alike: dict[str, set[str]] = {}
+    for label in {s.label for stop in survey.stops for s in stop.sightings} | {k.label for k in survey.known_labels}:
+        alike.setdefault("".join(label.split()).casefold(), set()).add(label)
+    twice = sorted(" and ".join(repr(name) for name in sorted(names)) for names in alike.values() if len(names) > 1)
+    if twice:
+        found.append(f"labels {_some(twice)} differ only in case or spaces; if they are the same, write them alike")
+    return found
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def check_positions(result: Map, problems: Problems) -> None:

@@ -9,7 +9,7 @@ from robotd.geometry.transforms import heading_matrix, rotation_matrix, rotation
 from robotd.records import KnownLabel, Transform
 from robotd.solver import solve
 from robotd.solver.readings import with_moves, with_pixels
-from tests.store_surveys import World, load, simulate
+from tests.store_surveys import World, in_legs, load, simulate
 
 WORLD = World(reflections=0.05, slip=0.0)
 
@@ -194,3 +194,69 @@ def test_wrong_sightings_slips_and_noise_are_no_mistake_of_who_wrote_the_survey(
     survey, _ = simulate(load(store), 11, World(wheel=0.006), outliers=share)
     notes = solve(survey).notes
     assert not any("check" in note for note in notes), notes
+
+
+def test_legs_of_two_stores_are_told_apart_and_nothing_is_placed():
+    survey, truth = survey_of("room")
+    other, others = survey_of("warehouse")
+    ids = dict(zip(sorted(others), [*sorted(truth), *map(str, range(len(others)))], strict=False))
+    stops = [
+        replace(stop, leg=2, sightings=tuple(replace(s, label=ids[s.label]) for s in stop.sightings))
+        for stop in other.stops
+    ]
+    result = solve(replace(survey, stops=(*survey.stops, *stops)))
+    assert any("each leg fits by itself" in note for note in result.notes), result.notes
+    assert not any(label.status == "placed" for label in result.labels)
+
+
+def test_labels_that_hung_elsewhere_for_the_second_leg_are_not_placed_in_between():
+    survey, truth = survey_of("room")
+    legs = in_legs(survey, len(survey.stops) // 2)
+    moved = [label for label in sorted(truth) if label.startswith("S")]
+    after = dict(zip(moved, [*moved[3:], *moved[:3]], strict=True))
+    stops = [
+        stop
+        if stop.leg == 1
+        else replace(stop, sightings=tuple(replace(s, label=after.get(s.label, s.label)) for s in stop.sightings))
+        for stop in legs.stops
+    ]
+    before = {now: truth[was] for was, now in after.items()}
+    for m in solve(replace(legs, stops=tuple(stops))).labels:
+        if m.status == "placed":
+            places = [truth[m.label], before.get(m.label, truth[m.label])]
+            assert min(np.linalg.norm(np.subtract(m.position, place)) for place in places) < 0.05, m
+
+
+def test_known_labels_of_which_those_along_a_line_are_left_do_not_mirror_the_world():
+    survey, truth = survey_of("room")
+    row = [label for label in sorted(truth) if label.startswith("S")][:3]
+    aside = next(label for label in sorted(truth) if label.startswith("N"))
+    result = solve(replace(survey, known_labels=measured(truth, [*row, aside], lambda p: p * [1.0, -1.0, 1.0])))
+    assert any("mirrored" in note for note in result.notes), result.notes
+    errors = [np.linalg.norm(np.subtract(m.position, truth[m.label])) for m in result.labels if m.status == "placed"]
+    assert len(errors) > 0.9 * len(truth)
+    assert max(errors) < 0.1
+
+
+def with_mounts(survey, change):
+    cameras = [
+        replace(c, T_robot_camera=replace(c.T_robot_camera, translation=change(*c.T_robot_camera.translation)))
+        for c in survey.rig.cameras
+    ]
+    return replace(survey, rig=replace(survey.rig, cameras=tuple(cameras)))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: with_mounts(s, lambda x, y, z: (x, y, 0.0)), "stands on the floor"),
+        (lambda s: with_mounts(s, lambda x, y, z: (x + 1.5, y, z)), "from the robot's middle"),
+        (lambda s: replace(s, priors=replace(s.priors, camera_translation_m=1.0)), "priors.camera_translation_m is 1"),
+        (lambda s: replace(s, known_labels=(KnownLabel("S02", (0.0, 0.0, 1.0), 2.5e-5),)), "which nobody measures"),
+        (lambda s: replace(s, known_labels=(KnownLabel("s02 ", (0.0, 0.0, 1.0), 0.005),)), "only in case or spaces"),
+    ],
+    ids=["height", "aside", "prior", "exact", "names"],
+)
+def test_what_is_possible_and_seldom_meant_is_noted(change, said):
+    survey, _ = survey_of("room")
+    assert any(said in note for note in solve(change(survey)).notes)

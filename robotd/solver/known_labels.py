@@ -36,7 +36,8 @@ def slips_often(problem: Problem) -> bool:
 def contradicted(asked: Problem, found: Problem, points: Floats) -> bool:
     """Whether moves or sightings contradict the known labels that fix the world frame, given the points (L, 3) found.
 
-    Two that are left when another was dropped fit a world and its mirror image alike; then all of them tell.
+    Two, or some along a line, that are left when another was dropped fit a world and its mirror image alike; then all
+    tell.
     """
     if asked.frame != "known labels":
         return False
@@ -45,7 +46,8 @@ def contradicted(asked: Problem, found: Problem, points: Floats) -> bool:
         return True
     seen = np.isin(asked.known.label, found.sightings.label)
     given, here = asked.known.position[seen], points[asked.known.label[seen]]
-    return dropped > 0 and left <= 2 and difference(given, here) != ""
+    open_ = left <= 2 or _along_a_line(found.known.position)
+    return dropped > 0 and open_ and difference(given, here) != ""
 
 
 def undecided(asked: Problem, points: Floats) -> bool:
@@ -83,11 +85,16 @@ def on_a_line(problem: Problem) -> str | None:
     """A caution if mirrored positions of the known labels would fit as well."""
     if problem.frame != "known labels":
         return None
-    seen = problem.known.position[np.isin(problem.known.label, problem.sightings.label), :2]
-    spread = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
-    if len(spread) > 1 and spread[1] > _ON_A_LINE_M:
+    seen = problem.known.position[np.isin(problem.known.label, problem.sightings.label)]
+    if not _along_a_line(seen):
         return None
     return (
         f"the {len(seen)} known labels that were seen hang along one line, so that nothing would show if an axis of "
         "their positions were counted the other way; measure one that hangs aside"
     )
+
+
+def _along_a_line(positions: Floats) -> bool:
+    """Whether positions (K, 3) are on one line in the plane, so that mirrored ones would fit as well."""
+    spread = np.linalg.svd(positions[:, :2] - positions[:, :2].mean(axis=0), compute_uv=False)
+    return len(spread) < 2 or bool(spread[1] <= _ON_A_LINE_M)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -35,6 +35,9 @@ _SCATTERS, _SCATTERS_NOT = 1.8, 1.4  # times their stated standard deviations, o
 _NO_LENS = 4.0  # times that, where many sightings do not fit at all
 _SLIPPING = 0.25  # of the moves, and two: wheels slip once in twenty metres
 _MOSTLY_SLIPPED, _MANY_SLIPPED = 0.8, 3  # of the moves from which nothing is placed
+_MOST_LEGS, _TOGETHER, _BY_THEMSELVES = 8, 0.95, 0.9  # legs, and shares of the sightings, to hold legs apart
+_APART, _ASUNDER = 0.05, 0.25  # by which legs fit better by themselves, to say so and to refuse them
+_FEW_MOVED, _MOVED_SHARE = 3, 0.3  # labels, and of those that two legs share, from which things were moved
 _SUNKEN_M = 0.05  # below the floor, that slopes and steps explain
 _MANY_SUNKEN, _SUNKEN_SHARE = 3, 0.15  # labels, and of all labels, from which heights are doubted
 _STRAINED = 4.0  # standard deviations, of one value; of a root mean square over a rig half of it
@@ -121,8 +124,11 @@ def misfit(asked: Problem, optimum: Optimum) -> Misfit:
     """Judge how much of a survey its optimum explains, and look for the mistake if that is little."""
     seen = strain(optimum.stated or optimum)
     little = f"only {100 * seen.share:.0f} % of the sightings fit any map, so few labels are placed"
+    apart = _legs_apart(asked, seen)
+    if apart is not None and apart.refused:
+        return apart
     if seen.is_there and len(asked.sightings) <= MOST_TO_TRY:
-        found = _best_reading(asked, seen)
+        found = _best_reading(asked, seen, int(np.count_nonzero(optimum.placed)))
         if found is not None:
             reading, said, other = found
             where = _where(reading)
@@ -152,6 +158,10 @@ def misfit(asked: Problem, optimum: Optimum) -> Misfit:
     if seen.strange:
         text = f"only {100 * seen.share:.0f} % of the sightings fit, of some cameras hardly any"
         return Misfit(seen.share, f"{text}: check the lenses, the pictures' size and which camera is which", True)
+    if apart is not None:
+        return apart
+    if (moved := _moved_between_legs(optimum)) is not None:
+        return Misfit(seen.share, moved, False)
     if seen.share >= FITS:
         text = f"only {100 * seen.share:.0f} % of the sightings fit; a label that two stops saw may be wrong by chance"
         return Misfit(seen.share, text if seen.share < _UNSURE else None, False)
@@ -159,7 +169,47 @@ def misfit(asked: Problem, optimum: Optimum) -> Misfit:
     return Misfit(seen.share, f"{little}; check {what}", False)
 
 
-def _best_reading(asked: Problem, seen: Strain) -> tuple[Reading, str, Strain] | None:
+def _legs_apart(asked: Problem, seen: Strain) -> Misfit | None:
+    """A misfit if each leg fits by itself and the legs together do not; refused if they hardly do."""
+    stops, survey = asked.survey.stops, asked.survey
+    legs = sorted({stop.leg for stop in stops})
+    if not 2 <= len(legs) <= _MOST_LEGS or seen.share > _TOGETHER or len(asked.sightings) > MOST_TO_TRY:
+        return None
+    explained, total = 0.0, 0
+    for leg in legs:
+        alone = build_problem(replace(survey, stops=tuple(stop for stop in stops if stop.leg == leg)))
+        if len(alone.sightings) < LEAST_LIGHTS:
+            continue
+        explained += explained_share(optimise(alone, thorough=False)) * len(alone.sightings)
+        total += len(alone.sightings)
+    share = explained / max(total, 1)
+    if share < _BY_THEMSELVES or share < seen.share + _APART:
+        return None
+    text = (
+        f"each leg fits by itself ({100 * share:.0f} % of the sightings), together only {100 * seen.share:.0f} % do: "
+        "are all of the same store, rig and label ids, and was anything moved between them?"
+    )
+    return Misfit(seen.share, text, share > seen.share + _ASUNDER)
+
+
+def _moved_between_legs(optimum: Optimum) -> str | None:
+    """A sentence if many of the labels that join a leg to the others hang elsewhere for one of them."""
+    problem, s, found = optimum.problem, optimum.problem.sightings, list[str]()
+    count, leg = len(problem.labels), problem.leg[s.stop]
+    for number in sorted(set(leg.tolist()))[1:]:
+        inside = leg == number
+        seen = [np.bincount(s.label[mine], minlength=count) > 0 for mine in (inside, ~inside)]
+        fits = [np.bincount(s.label[mine & optimum.inlier], minlength=count) > 0 for mine in (inside, ~inside)]
+        both, agree = seen[0] & seen[1] & (fits[0] | fits[1]), fits[0] & fits[1]
+        apart = int(np.count_nonzero(both & ~agree))
+        if apart >= _FEW_MOVED and apart > _MOVED_SHARE * np.count_nonzero(both):
+            found.append(f"leg {number} shares {np.count_nonzero(both)} labels with the others, of which {apart}")
+    if not found:
+        return None
+    return f"{'; '.join(found[:3])} hang elsewhere there: was anything moved, or is it of another store?"
+
+
+def _best_reading(asked: Problem, seen: Strain, placed: int) -> tuple[Reading, str, Strain] | None:
     """The mistake without which the survey fits clearly better, what to call it, and how it fits then."""
     best: tuple[Reading, Optimum, Strain] | None = None
     for reading in _readings(asked, seen):
@@ -168,6 +218,8 @@ def _best_reading(asked: Problem, seen: Strain) -> tuple[Reading, str, Strain] |
         except InputError:  # read like that it would be impossible
             continue
         other = strain(optimum)
+        if int(np.count_nonzero(optimum.placed)) < placed:  # sightings that are left out fit nothing
+            continue
         more = other.share - seen.share
         better = more > _CLEARLY_BETTER or (more > _RATHER_BETTER and other.share > _NEARLY_ALL)
         if not (better or seen.is_relieved(other)):

@@ -25,7 +25,7 @@ from ..errors import InputError, SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
 from ..records import CameraModel, Floats, Matrix3, Survey
-from ..survey_checks import Problems, check_roof, check_units
+from ..survey_checks import Problems, check_roof, check_units, oddities
 from .wheel_errors import EXACT, arc_by_errors, coupling, move_by_errors, odometry_sigmas
 
 Ints = NDArray[np.int64]
@@ -281,7 +281,7 @@ def build_problem(survey: Survey) -> Problem:
         odometry=np.array([pose_array(stop.odometry) for stop in survey.stops]),
         prior_sigma=_prior_sigma(survey, roofs, axes, fixed_first=frame == "first stop"),
         frame=frame,
-        notes=(*notes, *gaps),
+        notes=(*oddities(survey), *notes, *gaps),
     )
 
 
