@@ -165,8 +165,15 @@ def oddities(survey: Survey) -> list[str]:
     alike: dict[str, set[str]] = {}
     for label in {s.label for stop in survey.stops for s in stop.sightings} | {k.label for k in survey.known_labels}:
         alike.setdefault("".join(label.split()).casefold(), set()).add(label)
-    twice = sorted(" and ".join(repr(name) for name in sorted(names)) for names in alike.values() if len(names) > 1)
-    if twice:
+    several = [names for names in alike.values() if len(names) > 1]
+    # where both are seen from one stop, ids that differ in case are of different labels
+    together = any(
+        sum(name in seen for name in names) > 1
+        for seen in ({s.label for s in stop.sightings} for stop in (survey.stops if several else ()))
+        for names in several
+    )
+    twice = sorted(" and ".join(repr(name) for name in sorted(names)) for names in several)
+    if twice and not together:
         found.append(f"labels {_some(twice)} differ only in case or spaces; if they are the same, write them alike")
     return found
 

@@ -40,10 +40,14 @@ _SQUARED = 10.0  # times a stated standard deviation, from which a square is tho
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Something stated of a survey, and what it is called: entries of the frame vector, or a kind of measurement."""
+    """Something stated of a survey, and what it is called: entries of the frame vector, or a kind of measurement.
+
+    If `along` (entries,) is given, only the entries' common error in this direction is judged.
+    """
 
     name: str
     entries: Ints | None = None
+    along: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,13 +124,16 @@ def judge(adjustment: Adjustment, state: State, sure: Covariance) -> list[tuple[
     if frame is None:
         return []
     result = []
-    for kind in _priors(problem):
+    for kind in (*_priors(problem), *_of_whole_rig(problem)):
         assert kind.entries is not None
         prior = problem.prior_sigma[kind.entries]
         entries, prior = kind.entries[prior > 0.0], prior[prior > 0.0]
         if len(entries):
             left = frame[np.ix_(entries, entries)] / np.outer(prior, prior)
-            result.append((kind, _chi_square((state.frame[entries] / prior)[None], left[None])))
+            z = state.frame[entries] / prior
+            if kind.along is not None:
+                z, left = np.array([kind.along @ z]), np.array([[kind.along @ left @ kind.along]])
+            result.append((kind, _chi_square(z[None], left[None])))
     linear = adjustment.linearise(state, SQUARE)
     steady = ~problem.moves.loosened
     if steady.any():
@@ -170,6 +177,23 @@ def _priors(problem: Problem) -> Iterator[Kind]:
         yield Kind("the beacons' places", np.arange(problem.beacon_entry, last - ODOMETRY))
     for k, name in enumerate(("scale", "turns", "drift")):
         yield Kind(f"odometry's {name}", np.array([last - ODOMETRY + k]))
+
+
+def _of_whole_rig(problem: Problem) -> Iterator[Kind]:
+    """What all cameras have in common if the rig sits askew or aside on the robot, where that is not held fixed.
+
+    Such an error strains moves and cameras alike, each a little (W. Baarda, 1968: the more special alternative).
+    """
+    first, count = STOP * problem.stop_count + CAMERA * np.arange(len(problem.cameras)), len(problem.cameras)
+    if count < 2:
+        return
+    direction, place = (first[:, None] + np.arange(k, k + 3) for k in (0, 3))
+    if (problem.prior_sigma[direction] > 0.0).all():
+        yield Kind("the cameras' direction", direction.ravel(), problem.R_robot_camera[:, 2].ravel() / np.sqrt(count))
+    if (problem.prior_sigma[place] > 0.0).all():
+        for axis in (0, 1):
+            along = np.tile(np.eye(3)[axis], count) / np.sqrt(count)
+            yield Kind("the cameras' place", place.ravel(), along)
 
 
 def _with(problem: Problem, kind: Kind, factor: float) -> Problem:
@@ -253,6 +277,8 @@ def remarks(stated: Problem, problem: Problem, judged: list[tuple[Kind, Judged]]
         if len(now) and len(was) and (times := float(np.median(now) / np.median(was))) > _SAID:
             found.append(_remark(Kind(name), times, float(np.median(was))))
     for kind, tally in judged:
+        if kind.along is not None:
+            continue
         small = tally.factor < _TOO_WIDE and 1.0 - tally.likely < _DOUBT
         if small and (kind.entries is None or not said & set(kind.entries.tolist())):
             said.update(() if kind.entries is None else kind.entries.tolist())

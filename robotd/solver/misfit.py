@@ -249,7 +249,7 @@ def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
         for reading in chain(signs(survey), orders(survey), rigs(survey)):
             if reading.kind != CAMERAS or seen.share < _MOSTLY:  # exchanged cameras leave no survey that fits
                 yield reading
-    if everything and not seen.scatters:
+    if not seen.scatters and (everything or seen.share < 0.5 * (FITS + _MOSTLY)):
         yield from lenses(survey)
 
 

@@ -22,7 +22,7 @@ from .hypotheses import Hypotheses, behind_glass, hypotheses, in_floor, out_of_g
 from .initial import epipolar_moves
 from .known_labels import contradicted, difference, slipped, slips_often, undecided
 from .placement import Placement, at_first_stop, detach, place, ray_tolerance, retriangulate
-from .problem import SIGMA_FLOOR_PX, Bools, Problem, State, stops_per_label
+from .problem import SIGMA_FLOOR_PX, STOP, Bools, Problem, State, stops_per_label
 from .references import IMPOSSIBLE, POSSIBLE, agreeing, beacons_disagree, bends, chance
 from .strangers import without_strangers
 from .tie_sightings import without_ties
@@ -38,7 +38,8 @@ _FEW_DOUBTS = 0.001  # share of sightings not explained, below which labels are 
 _CLEAN = 0.97  # share of sightings explained at which no other start can do better
 _SAME = 0.5  # difference of two starts' costs below which they found the same minimum
 _SCATTERS, _LESS = 1.3, 0.7  # times a stated standard deviation, and of that, from which priors are doubted instead
-_LITTLE = 20.0  # times a prior, so that it holds little
+_MANY_SLIPS, _FEWER_SLIPS = 3, 3  # moves from which priors are doubted instead, and the times that must be fewer then
+_LITTLE, _LEAST = 20.0, 100.0  # times a prior, and a camera's, so that it holds little
 _ROUNDS = 8  # of widening what the survey states too small
 _BREAKS = 4  # times that moves are looked for which are not the robot's
 _JOINED = 3  # sightings that must fit in addition without them
@@ -192,28 +193,48 @@ def _borne_out(optimum: Optimum) -> Optimum:
     return replace(result, problem=replace(result.problem, notes=(*result.problem.notes, *said))) if said else result
 
 
-def _instead_of_scatter(optimum: Optimum) -> Optimum:
-    """The optimum in which priors and moves give way, if sightings scatter more than stated for their sake alone.
+def _rig_is_to_blame(problem: Problem, optimum: Optimum) -> bool:
+    """Whether moves hardly slip beside a rig that may be anywhere near."""
+    free = _from_starts(replace(problem, prior_sigma=_little(problem)), None, None, thorough=False)
+    fits = np.count_nonzero(free.inlier) >= np.count_nonzero(optimum.inlier)
+    return bool(fits and _FEWER_SLIPS * slipped(free.problem) <= slipped(optimum.problem))
 
-    Sightings that scatter make all else look right. So priors and moves are tried that hold little; where sightings
-    then scatter much less, their noise is what is left, and against it the others are judged.
+
+def _little(problem: Problem) -> Floats:
+    """(F,) priors that hold little, the cameras' least."""
+    prior = _LITTLE * problem.prior_sigma
+    prior[STOP * problem.stop_count : problem.roof_entry] *= _LEAST / _LITTLE
+    return prior
+
+
+def _instead_of_scatter(optimum: Optimum) -> Optimum:
+    """The optimum in which priors and moves give way, if sightings scatter or moves slip for their sake alone.
+
+    Sightings that scatter and moves that were loosened make all else look right. So priors and moves are tried that
+    hold little; where sightings then scatter much less, their noise is what is left, and against it the others are
+    judged. Where they do not scatter, and moves slip much less beside free priors, these are judged as well.
     """
-    factor = scatter(optimum.problem)
-    if factor <= _SCATTERS or len(optimum.problem.sightings) > MOST_TO_TRY:
+    factor, slips = scatter(optimum.problem), slipped(optimum.problem)
+    scatters = factor > _SCATTERS
+    if not (scatters or slips >= _MANY_SLIPS) or len(optimum.problem.sightings) > MOST_TO_TRY:
         return optimum
     base, prior = optimum.base, optimum.base.prior_sigma
-    known, slipping = base.known, base.moves.covariance + slip_covariance(base.moves.measured)
+    known, slipping = base.known, base.moves.covariance
+    if scatters:
+        slipping = slipping + slip_covariance(base.moves.measured)
     little = replace(
         base,
-        prior_sigma=_LITTLE * prior,
+        prior_sigma=_little(base),
         moves=replace(base.moves, covariance=slipping),
         known=replace(known, sigma=_LITTLE * known.sigma),
     )
     free = _from_starts(little, None, None, thorough=False)
     fewer = np.count_nonzero(free.inlier) < np.count_nonzero(optimum.inlier)
-    if scatter(free.problem) > _LESS * factor or fewer or not free.placed.all():
+    if not _better(free, factor if scatters else None, slips) or fewer or not free.placed.all():
         return optimum
-    state, base = free.state, rescaled_moves(base, free.state, free.placed) or base
+    state = free.state
+    if scatters:
+        base = rescaled_moves(base, state, free.placed) or base
     problem = replace(free.problem, prior_sigma=prior, moves=base.moves, known=known)
     problem = without_wrong(Adjustment(problem, problem.sightings), state)
     for _ in range(_ROUNDS):
@@ -226,12 +247,20 @@ def _instead_of_scatter(optimum: Optimum) -> Optimum:
     vaguer = np.median(problem.known.sigma) / np.median(known.sigma) if len(problem.known.sigma) else 1.0
     known = replace(known, sigma=known.sigma * vaguer)
     other = _from_starts(replace(base, prior_sigma=problem.prior_sigma, known=known), None, None)
-    return other if scatter(other.problem) < _LESS * factor else optimum
+    return other if _better(other, factor if scatters else None, slips) else optimum
+
+
+def _better(optimum: Optimum, scattered: float | None, slips: int) -> bool:
+    """Whether sightings scatter much less than they did, or, if they did not, moves slip much less."""
+    if scattered is not None:
+        return scatter(optimum.problem) < _LESS * scattered
+    return _FEWER_SLIPS * slipped(optimum.problem) <= slips
 
 
 def _optimise(problem: Problem, start: Floats | None, grown: Placement | None) -> Optimum:
     optimum = _from_starts(problem, start, grown)
-    if slips_often(optimum.problem) and (wider := rescaled_moves(problem, optimum.state, optimum.placed)) is not None:
+    wider = rescaled_moves(problem, optimum.state, optimum.placed) if slips_often(optimum.problem) else None
+    if wider is not None and not _rig_is_to_blame(problem, optimum):
         other = _from_starts(wider, start, None)
         steadier = 2 * slipped(other.problem) <= slipped(optimum.problem)
         if steadier and np.count_nonzero(other.inlier) > 0.98 * np.count_nonzero(optimum.inlier):
