@@ -53,6 +53,23 @@ cdef inline float _at(
     return image[row * width + col]
 
 
+cdef inline float _beside(
+    const unsigned char *image, const unsigned char *valid, bint masked, int height, int width,
+    const float *at, const float *t, float half, float from_, float step, int side,
+) noexcept nogil:
+    """Mean grey level of three places beside a line, in half widths of at least 4 px from its border; -1 outside."""
+    cdef float unit = half if half > 4.0 else <float> 4.0, reach, value, total = 0.0
+    cdef int k, shown = 0
+    for k in range(3):
+        reach = half + (from_ + step * k) * unit
+        reach = reach if side == 1 else -reach
+        value = _at(image, valid, masked, height, width, at[0] - reach * t[1], at[1] + reach * t[0])
+        if value >= 0.0:
+            total += value
+            shown += 1
+    return total / shown if shown > 0 else <float> -1.0
+
+
 cdef inline float _log(float value, float low, float high) noexcept nogil:
     return logf(low if value < low else (high if value > high else value))
 
@@ -68,7 +85,7 @@ def judge(
     float[:, ::1] scratch,
     float[:, ::1] out,
 ):
-    cdef int height = <int> image.shape[0], width = <int> image.shape[1], p, n, i, k, side, shown, few, good, steps
+    cdef int height = <int> image.shape[0], width = <int> image.shape[1], p, n, i, k, side, shown, good, steps
     cdef bint masked = valid.shape[0] > 0
     cdef const unsigned char *grey = &image[0, 0]
     cdef const unsigned char *mask = &valid[0, 0] if valid.shape[0] > 0 else NULL
@@ -115,36 +132,15 @@ def judge(
                     continue
                 level /= 3.0
                 for side in range(2):
-                    beside[side] = 0.0
-                    few = 0
-                    for k in range(3):
-                        reach = half + (<float> 0.5 + <float> 0.25 * k) * (half if half > 4.0 else <float> 4.0)
-                        reach = reach if side == 1 else -reach
-                        value = _at(
-                            grey, mask, masked, height, width, path[2 * i] - reach * t[1], path[2 * i + 1] + reach * t[0]
-                        )
-                        if value >= 0.0:
-                            beside[side] += value
-                            few += 1
-                    beside[side] = beside[side] / few if few > 0 else <float> -1.0
+                    beside[side] = _beside(grey, mask, masked, height, width, path + 2 * i, t, half, 0.5, 0.25, side)
                 if beside[0] < 0.0 or beside[1] < 0.0:
                     continue
                 for k in range(3):
                     inner += fabsf(inside[k] - level)
                 for side in range(2):
-                    turn = 0.0
-                    few = 0
-                    for k in range(3):
-                        reach = half + (<float> 1.5 + <float> 0.5 * k) * (half if half > 4.0 else <float> 4.0)
-                        reach = reach if side == 1 else -reach
-                        value = _at(
-                            grey, mask, masked, height, width, path[2 * i] - reach * t[1], path[2 * i + 1] + reach * t[0]
-                        )
-                        if value >= 0.0:
-                            turn += value
-                            few += 1
-                    if few > 0:
-                        beyond[side] += sign * (level - turn / few)
+                    value = _beside(grey, mask, masked, height, width, path + 2 * i, t, half, 1.5, 0.5, side)
+                    if value >= 0.0:
+                        beyond[side] += sign * (level - value)
                         beyonds[side] += 1
                 # how much of the step lies right at the borders
                 reach = 0.3 * half if half > 5.0 else <float> 1.5
