@@ -29,7 +29,6 @@ log = logging.getLogger(__name__)
 MODE = 0o660
 CLIENTS = 16
 OPEN_REQUESTS = 16  # of one client
-BUFFER = 256 << 10  # bytes that wait for a slow client, before what it subscribed to is dropped
 WRITE_S = 10.0  # a client that takes nothing for so long is gone
 PEER = struct.Struct("3i")  # pid, uid, gid: struct ucred, unix(7)
 

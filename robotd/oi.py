@@ -31,7 +31,6 @@ from .oi_packets import (
 HEADER = 19
 TICK = 0.015  # s between two updates of the robot's sensor values
 COUNT = 0.000444565  # m of wheel travel per encoder count (packets 43, 44): pi * 72.0 mm / 508.8
-WHEEL_SPEED_MAX = 0.5  # m/s
 OFF, PASSIVE, SAFE, FULL = range(4)
 BAUD_CODES = (300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 57600, 115200)  # index = code of opcode 129
 STRAIGHT, STRAIGHT_TOO, SPIN_CLOCKWISE, SPIN_COUNTER_CLOCKWISE = -0x8000, 0x7FFF, -1, 1  # radius codes of opcode 137

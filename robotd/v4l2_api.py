@@ -199,7 +199,6 @@ def _number(direction: int, number: int, record: Any) -> int:
 _WRITE, _READ = 1, 2
 QUERYCAP = _number(_READ, 0, Capability)
 ENUM_FMT = _number(_READ | _WRITE, 2, FormatDescription)
-G_FMT = _number(_READ | _WRITE, 4, Format)
 S_FMT = _number(_READ | _WRITE, 5, Format)
 REQBUFS = _number(_READ | _WRITE, 8, RequestBuffers)
 QUERYBUF = _number(_READ | _WRITE, 9, Buffer)

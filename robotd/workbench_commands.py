@@ -30,7 +30,7 @@ from .workbench.tags import NEAR_PX, Tag, add_tag, load_tags, remove_tags, save_
 from .workbench.trace import Trace
 from .workbench.tune import Trial, parse_range, score_set, shared, tune as search
 
-QUANTILES = (5, 25, 50, 75, 95)
+QUANTILES = (5, 25, 50, 75, 95)  # percent of what is told of a distribution
 _LATE_S = 1.0  # after the last frame, that may still be asked for
 
 
@@ -254,8 +254,7 @@ def compare(arguments: argparse.Namespace) -> int:
     }
     table = {
         name: {
-            where: {f"{q}%": round(float(np.percentile(chosen, q)), 4) for q in (5, 25, 50, 75, 95)}
-            | {"n": len(chosen)}
+            where: {f"{q}%": round(float(np.percentile(chosen, q)), 4) for q in QUANTILES} | {"n": len(chosen)}
             for where, chosen in (("on_labels", on_label), ("elsewhere", elsewhere))
             if chosen
         }

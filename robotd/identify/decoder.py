@@ -150,7 +150,7 @@ def _pass(
     for names, odds in claims:
         elsewhere[names] += odds
     again = _again(elsewhere).astype(np.float32)
-    kernels = [delays.kernel(slot.begun, fetch, slot.window) for slot, fetch in zip(evidence, fetches, strict=True)]
+    kernels = [delays.kernel(fetch, slot.window) for slot, fetch in zip(evidence, fetches, strict=True)]
     weights = prior.weights / max(float(prior.weights.sum()), 1e-30)
     ours = np.log(np.maximum((1.0 - config.none_fraction) * weights, 1e-30)).astype(np.float32)
     label, probability = np.zeros(lights, np.intp), np.zeros(lights)

@@ -123,13 +123,11 @@ class DelayModel:
         """Seconds from the sending of a request to the poll that finds it, (P,)."""
         return self._offsets
 
-    def kernel(self, begun: float, fetch: Floats, window: float) -> Kernel:
+    def kernel(self, fetch: Floats, window: float) -> Kernel:
         """Density of a flash's lateness, relative to one that is uniform over `window` seconds.
 
         Parameters
         ----------
-        begun : float
-            When the slot's first request was sent.
         fetch : (P,) array
             Probability of the offsets, e.g. of `fetch`.
         window : float

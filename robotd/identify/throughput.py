@@ -46,7 +46,7 @@ def search_interval(evidence: Sequence[Evidence], prior: Prior, delays: DelayMod
     for slot in evidence:
         flashed[: len(slot.scores)] += slot.scores.max(axis=1, initial=0.0) > 3.0
     chosen = np.argsort(-flashed, kind="stable")
-    kernels = [delays.kernel(slot.begun, delays.fetch(slot.begun), slot.window) for slot in evidence]
+    kernels = [delays.kernel(delays.fetch(slot.begun), slot.window) for slot in evidence]
     owner, labels, fixed, ends = _pairs(evidence, prior, chosen, kernels, delays)
     answers, decided = _answers(evidence, kernels, chosen, owner, labels, delays)
     fixed += decided

@@ -73,7 +73,7 @@ def join(
     offset, notes = _offset(stops, dates, known, world)
     if offset is None:
         return Joined((), {}, {}, 0.0, notes)
-    names = _names(known, calibrations)
+    names = _names(known)
     lenses = {digest: Lens(calibrations[digest].lens) for digest in names}
     sightings: dict[StopKey, tuple[BeaconSighting, ...]] = {}
     poses: dict[StopKey, RoofPose] = {}
@@ -116,7 +116,7 @@ def with_roof(survey: Survey, joined: Joined) -> Survey:
     return replace(survey, roof_cameras=cameras, stops=stops)
 
 
-def _names(dwells: Sequence[Dwell], calibrations: Mapping[str, RoofCalibration]) -> dict[str, str]:
+def _names(dwells: Sequence[Dwell]) -> dict[str, str]:
     """A camera's name by digest of its calibration; a camera that was calibrated anew is two in a survey."""
     by_camera: dict[str, list[str]] = {}
     for dwell in dwells:
