@@ -15,17 +15,16 @@ fixed: they have no column in the normal equations, so that a planar problem cos
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import sighting_columns
-from ..errors import InputError, SolverError
+from ..errors import SolverError
 from ..geometry.camera import Camera
 from ..geometry.transforms import pose_array, se2_relative
-from ..records import CameraModel, Floats, Matrix3, Survey
-from ..survey_checks import Problems, check_roof, check_units, oddities
+from ..records import Floats, Survey
+from ..survey_checks import oddities
+from .consistency import Columns, camera_of, checked_columns
 from .wheel_errors import EXACT, arc_by_errors, coupling, move_by_errors, odometry_sigmas
 
 Ints = NDArray[np.int64]
@@ -147,40 +146,6 @@ class State:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Columns:
-    """All sightings of a survey, in its order: (N,) arrays, `camera` -1 where the rig has none of that name."""
-
-    stop: Ints
-    camera: Ints
-    names: list[str]
-    uv: Floats
-    sigma: Floats
-    probability: Floats
-
-    @classmethod
-    def of(cls, survey: Survey) -> Columns:
-        """The columns of a survey; defaults stand in for what is not given."""
-        rows = [s for stop in survey.stops for s in stop.sightings]
-        cameras = {camera.name: i for i, camera in enumerate(survey.rig.cameras)}
-        default = survey.sigmas.pixel_px if survey.sigmas.pixel_px > 0.0 else 1.0
-        camera, names, (u, v, sigma, probability) = sighting_columns.read(rows, cameras, default)
-        return cls(
-            stop=np.repeat(np.arange(len(survey.stops)), [len(stop.sightings) for stop in survey.stops]),
-            camera=camera,
-            names=names,
-            uv=np.column_stack([u, v]),
-            sigma=sigma,
-            probability=probability,
-        )
-
-    def suspects(self, stops: int) -> Bools:
-        """(S,) which stops have sightings that cannot be used."""
-        good = (self.camera >= 0) & np.isfinite(self.uv).all(axis=1) & np.isfinite(self.probability)
-        good &= np.isfinite(self.sigma) & (self.sigma > 0.0)
-        return np.bincount(self.stop[~good], minlength=stops) > 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """Everything the solver computes with; indices count stops in the survey's order and labels as in `labels`.
 
@@ -249,8 +214,8 @@ def build_problem(survey: Survey) -> Problem:
     if not survey.stops:
         raise SolverError(f"survey {survey.survey}: it has no stops, so there is nothing to map")
     survey = replace(survey, stops=tuple(sorted(survey.stops, key=lambda stop: (stop.leg, stop.stop))))
-    columns = _check(survey)
-    cameras = tuple(map(_camera, survey.rig.cameras))
+    columns = checked_columns(survey)
+    cameras = tuple(map(camera_of, survey.rig.cameras))
     labels = sorted({*columns.names, *(known.label for known in survey.known_labels)})
     sightings, notes = _sightings(columns, cameras, labels)
     moves, gaps = _moves(survey)
@@ -283,77 +248,6 @@ def build_problem(survey: Survey) -> Problem:
         frame=frame,
         notes=(*oddities(survey), *notes, *gaps),
     )
-
-
-@lru_cache(maxsize=32)
-def _camera(model: CameraModel) -> Camera:
-    """A camera; kept, because a survey that grows stop by stop asks for the same ones each time."""
-    return Camera(model)
-
-
-def _check(survey: Survey) -> Columns:
-    """Raise InputError if the survey contradicts itself; returns its sightings as columns."""
-    doubts = Problems(f"survey {survey.survey}")
-    check_units(survey, doubts)
-    problems = doubts.found
-    names = [camera.name for camera in survey.rig.cameras]
-    roofs = {roof.name for roof in survey.roof_cameras}
-    where = f"survey {survey.survey}"
-    if len(set(names)) < len(names):
-        problems.append(f"{where}: two cameras of the rig have the same name; names are {', '.join(names)}")
-    for camera in survey.rig.cameras:
-        try:
-            _camera(camera)
-        except ValueError as error:
-            problems.append(f"{where}: {error}")
-    for roof in survey.roof_cameras:
-        if not (np.isfinite(H := np.array(roof.H_world_image)).all() and abs(np.linalg.det(H)) > 1e-12):
-            problems.append(f"{where}: roof camera {roof.name}: H_world_image is not invertible")
-    for number, roof in enumerate(survey.roof_cameras):
-        check_roof(roof, f"roof_cameras[{number}]", doubts)
-    for known in survey.known_labels:
-        if not np.isfinite([*known.position, known.sigma_m]).all():
-            problems.append(f"{where}: known label {known.label}: position and sigma_m must be finite, got {known}")
-    ids = [known.label for known in survey.known_labels]
-    problems += [f"{where}: known label {i} is listed twice" for i in sorted({i for i in ids if ids.count(i) > 1})]
-    seen: set[tuple[int, int]] = set()
-    unknown: set[str] = set()
-    columns = Columns.of(survey)
-    suspect = columns.suspects(len(survey.stops))
-    for index, stop in enumerate(survey.stops):
-        at = f"{where}: leg {stop.leg} stop {stop.stop}"
-        if (stop.leg, stop.stop) in seen:
-            problems.append(f"{at} is there twice; remove one")
-        seen.add((stop.leg, stop.stop))
-        numbers = [stop.odometry.x, stop.odometry.y, stop.odometry.heading]
-        if stop.move is not None:
-            numbers += [stop.move.dx, stop.move.dy, stop.move.dheading, *np.ravel(stop.move.covariance)]
-            numbers += [] if stop.move.by_errors is None else [*np.ravel(stop.move.by_errors)]
-        for motion in stop.motions:
-            if not np.isfinite([motion.dx, motion.dy, motion.dheading, *np.ravel(motion.information)]).all():
-                problems.append(f"{at}: motion by {motion.source}: expected finite numbers, got {motion}")
-            elif not _semidefinite(motion.information):
-                problems.append(f"{at}: motion by {motion.source}: its information is not positive semidefinite")
-        if not np.isfinite(numbers).all():
-            problems.append(f"{at}: odometry and move must be finite numbers, got {stop.odometry} and {stop.move}")
-        elif stop.move is not None and not _semidefinite(stop.move.covariance):
-            problems.append(f"{at}: the move's covariance is not positive semidefinite")
-        for s in stop.sightings if suspect[index] else ():
-            if s.camera not in names and s.camera not in unknown:
-                unknown.add(s.camera)
-                expected = ", ".join(names) or "no cameras"
-                problems.append(f"{at}: sighting by unknown camera {s.camera!r}; the rig has {expected}")
-            numbers = [s.u, s.v, 1.0 if s.sigma_px is None else s.sigma_px, s.probability or 0.0]
-            if not (np.isfinite(numbers).all() and numbers[2] > 0.0):
-                problems.append(f"{at}: label {s.label}: u, v must be finite and sigma_px positive, got {s}")
-        for b in stop.beacon_sightings:
-            if b.roof_camera not in roofs or b.beacon not in survey.rig.beacons:
-                problems.append(f"{at}: beacon {b.beacon!r} seen by {b.roof_camera!r}: no such beacon or roof camera")
-            if not np.isfinite([b.u, b.v]).all() or (b.sigma_px is not None and not b.sigma_px > 0.0):
-                problems.append(f"{at}: beacon {b.beacon}: u, v must be finite and sigma_px positive, got {b}")
-    if problems:
-        raise InputError(*problems)
-    return columns
 
 
 def _sightings(columns: Columns, cameras: tuple[Camera, ...], labels: list[str]) -> tuple[Sightings, list[str]]:
@@ -389,13 +283,6 @@ def _sightings(columns: Columns, cameras: tuple[Camera, ...], labels: list[str])
     )
     order = np.argsort(camera, kind="stable")
     return everything.select(order[usable[order]]), notes
-
-
-def _semidefinite(rows: Matrix3) -> bool:
-    """Whether a covariance is one, within rounding."""
-    (a, b, c), (_, e, f), (_, _, i) = rows
-    minors = a, a * e - b * b, a * (e * i - f * f) - b * (b * i - f * c) + c * (b * f - e * c)
-    return min(minors) > 0.0 or bool(np.linalg.eigvalsh(np.array(rows)).min() >= -1e-9)
 
 
 def _moves(survey: Survey) -> tuple[Moves, list[str]]:
