@@ -35,7 +35,7 @@ def add_plan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     plan.add_argument(
         "--again", action="store_true", help="plan all of the line in a new leg, not what is ahead of the last stop"
     )
-    plan.add_argument("--stops", type=int, default=20, metavar="N", help="most stops to plan (default: 20)")
+    plan.add_argument("--stops", type=int, default=30, metavar="N", help="most stops to plan (default: 30)")
     plan.add_argument("--target", type=float, default=0.0, metavar="MM", help="standard deviation that is good enough")
     plan.add_argument("--stop-seconds", type=float, default=15.0, metavar="S", help="time a stop takes (default: 15)")
     plan.add_argument(
@@ -44,9 +44,9 @@ def add_plan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     plan.add_argument(
         "--least",
         type=float,
-        default=1.0,
+        default=0.4,
         metavar="PERCENT",
-        help="how much a stop must take off the labels' uncertainty to be worth making (default: 1)",
+        help="how much a stop must take off the labels' uncertainty to be worth making (default: 0.4)",
     )
     plan.add_argument("-o", "--output", type=Path, metavar="PLAN.json", help="default: stdout")
     plan.add_argument("--png", type=Path, metavar="PNG", help="also draw what each place would teach")

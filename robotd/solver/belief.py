@@ -70,11 +70,13 @@ class Rows:
 
     def joined(self, other: Rows) -> Rows:
         """These, then others."""
-        width = max(self.values.shape[1], other.values.shape[1])
-        pads = [((0, 0), (0, width - rows.values.shape[1])) for rows in (self, other)]
-        values = [np.pad(rows.values, pad) for rows, pad in zip((self, other), pads, strict=True)]
-        entries = [np.pad(rows.entries, pad, constant_values=-1) for rows, pad in zip((self, other), pads, strict=True)]
-        return Rows(np.concatenate(values), np.concatenate(entries))
+        count, width = len(self.values) + len(other.values), max(self.values.shape[1], other.values.shape[1])
+        values, entries, begin = np.zeros((count, width)), np.full((count, width), -1, dtype=np.int64), 0
+        for rows in (self, other):
+            here = np.s_[begin : begin + len(rows.values), : rows.values.shape[1]]
+            values[here], entries[here] = rows.values, rows.entries
+            begin += len(rows.values)
+        return Rows(values, entries)
 
 
 class Belief:

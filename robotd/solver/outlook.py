@@ -12,6 +12,7 @@ from ..errors import SolverError
 from ..geometry.transforms import wrap_angle
 from ..records import Floats, Map
 from .belief import Belief, Views
+from .problem import Bools
 from .robust import Optimum
 from .ways import Way
 
@@ -126,14 +127,16 @@ class Outlook:
     def _shows(self, views: Views, places: Floats) -> Floats:
         """(V,) probability that a place is on the side to which a label looks.
 
-        It shows within `_FIELD` to either side of its normal. Of the normal only this is known, that all places from
-        which the label was seen lie within that.
+        It shows within `_FIELD` to either side of its normal. Of the normal this is known, that all places from which
+        the label was seen lie within that; and it is rather turned away from them, because a robot that comes along a
+        shelf sees a label from the edge of its field first. So its density grows linearly from that edge.
         """
         away = places[views.place, :2] - self.belief.points[views.label, :2]
         turn = _turned(self.facing[views.label], away)
         first, last = self.seen_from[views.label].T
         beyond = np.maximum(np.maximum(first - turn, turn - last), 0.0)
-        return np.asarray(np.clip(1.0 - beyond / np.maximum(2.0 * _FIELD - (last - first), _FIELD / 10.0), 0.0, 1.0))
+        left = np.maximum(2.0 * _FIELD - (last - first), _FIELD / 10.0)
+        return np.asarray(np.maximum(1.0 - (beyond / left) ** 2, 0.0))
 
     def _judged(self, poses: Floats, guessed: Floats, past: Views) -> tuple[Floats, Floats]:
         """How many labels each stands for, and how many stops agree on its position (L,)."""
@@ -168,11 +171,24 @@ class Outlook:
             bearing = np.arctan2(*(poses[:, None, :2] - points).transpose(2, 0, 1)[::-1])
             here = np.arctan2(*(self.way.places[self.views.place, :2] - points[self.views.label]).T[::-1])
             like = np.exp(-((wrap_angle(bearing[:, self.views.label] - here) / _SIMILAR) ** 2))
-        like = np.where(expected[:, self.views.label], like, 0.0)
+        told = np.where(seen, 1.0, self._asked(seen, poses, past)[:, None])
+        like = np.where(expected[:, self.views.label], like * told[:, self.views.label], 0.0)
         likely = _SHOWS * self._shows(self.views, self.way.places)
         hits = (like * seen[:, self.views.label]).sum(axis=0)
         exists = np.minimum(self.weights, 1.0)[self.views.label]
         return np.asarray(exists * (likely + _SHOWS * hits) / (1.0 + like.sum(axis=0)))
+
+    def _asked(self, seen: Bools, poses: Floats, past: Views) -> Floats:
+        """(S,) how much it says at each stop that a label was not seen, 1 where all were asked.
+
+        A survey does not tell which labels a stop asked, and one that followed a plan asked few. So the share of those
+        that should have shown which did is taken for the share that was asked.
+        """
+        count = len(self.optimum.problem.labels)
+        likely = np.where(seen, _SHOWS, 0.0)
+        np.maximum.at(likely, (past.place, past.label), _SHOWS * self._shows(past, poses))
+        share = seen[:, :count].sum(axis=1) / np.maximum(likely[:, :count].sum(axis=1), 1.0)
+        return np.asarray(np.log(1.0 - _SHOWS * np.minimum(share, 1.0)) / np.log(1.0 - _SHOWS))
 
     def _wheels(self) -> Floats:
         """(3,) variance that a move gains per metre."""

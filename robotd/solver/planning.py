@@ -34,7 +34,8 @@ from .wheel_errors import SLIPPED
 _WRONG_M = 0.5  # error of a position that is wrong
 _APART = 0.35  # of the labels' usual distance lies between two stops: nearer ones see them from almost the same side
 _LONGEST = 0.75  # of it may: what walls hide from both, as behind a doorway, hangs on nothing but one stop between them
-_AHEAD = 0.75  # of the reach is looked ahead for each stop that is planned
+_AHEAD = 0.4  # of the reach is looked ahead for each stop that is planned
+_LEAST_AHEAD = 1.5  # times the reach is looked ahead however few they are
 _AT_ONCE = 600  # rows of flashes are judged together, which takes time as their square
 _JOINING = 6  # labels are asked at each stop, where so many show: one wrong name must not turn the robot's pose
 _SLIP_EVERY_M = 20.0  # a wheel slips, and then a move says little
@@ -51,12 +52,12 @@ class PlanSettings:
     `most_stops`, or when every label is known to `target_m`.
     """
 
-    most_stops: int = 20
+    most_stops: int = 30
     stop_s: float = 15.0
     flash_s: float = 0.5
     target_m: float = 0.0
-    least: float = 0.01
-    spare: float = 0.005
+    least: float = 0.004
+    spare: float = 0.0045
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +122,8 @@ def plan(
         result, (reach, _) = to_map(problem, optimum), distances(optimum)
         way = _way(optimum, line, free, again)
         settings = settings or PlanSettings()
-        near, way, note = nearby(optimum, result, way, settings.most_stops * _AHEAD * reach, reach)
+        horizon = max(settings.most_stops * _AHEAD, _LEAST_AHEAD) * reach
+        near, way, note = nearby(optimum, result, way, horizon, reach)
         return _Planner(Outlook(near, result, way), settings, () if note is None else (note,)).study()
 
 
@@ -178,8 +180,9 @@ class _Planner:
 
     def _apart(self, along: float, pose: Floats, place: int) -> float:
         """Metres to drive to a place."""
-        straight = float(np.hypot(*(self.places[place] - pose)[:2]))
-        return float(np.nanmax([self.way.along[place] - along, straight]))
+        x, y, _ = (self.places[place] - pose).tolist()
+        further = float(self.way.along[place]) - along  # NaN over free floor
+        return max(math.hypot(x, y), further)
 
     def _total(self, P: Floats, agreeing: Floats) -> float:
         return float(self._losses(self.belief.traces(P), agreeing).sum())
@@ -258,13 +261,16 @@ class _Planner:
     def _lean(self, chosen: list[_Choice], first: Floats) -> list[_Choice]:
         """Without stops that the others do not need."""
         while True:
-            P, agreeing, whole = self._with(chosen, first)
-            allowed = whole + self._margin(self._losses(self.belief.traces(P), agreeing), self.settings.least)
-            fewer = [[*chosen[:k], *chosen[k + 1 :]] for k in range(len(chosen)) if self._may_go(k, chosen)]
-            left = [self._with(rest, first)[2] for rest in fewer]
-            if not left or min(left) > allowed:
+            P, agreeing, done, left = first, self.outlook.agreeing, list[_Choice](), list[tuple[float, int]]()
+            for k, choice in enumerate(chosen):
+                if self._may_go(k, chosen):
+                    left.append((self._total(*self._with(chosen[k + 1 :], P, agreeing, done)[:2]), k))
+                P, agreeing, done = self._with([choice], P, agreeing, done)
+            losses = self._losses(self.belief.traces(P), agreeing)
+            if not left or min(left)[0] > losses.sum() + self._margin(losses, self.settings.least):
                 return chosen
-            chosen = fewer[int(np.argmin(left))]
+            _, gone = min(left)
+            chosen = [*chosen[:gone], *chosen[gone + 1 :]]
 
     def _may_go(self, k: int, chosen: Sequence[_Choice]) -> bool:
         """Whether its neighbours along the line are near enough to be joined without it."""
@@ -281,12 +287,8 @@ class _Planner:
         handed on to all behind it, and what a stop leaves out of a label others may make good. Each must be worth the
         same, at whichever stop: so a plan that is made anew at the next stop leaves out the same ones.
         """
-        count, agreeing, done = len(self.optimum.problem.labels), self.outlook.agreeing.copy(), list[_Choice]()
-        for choice in chosen:
-            P, entry = self.belief.with_stop(P)
-            done.append(replace(choice, entry=entry, link=self._link(choice.place, done, entry)))
-            P = self.belief.take(P, self._rows(done[-1]))
-            agreeing = self._agreeing_with(agreeing, choice.asked)
+        count = len(self.optimum.problem.labels)
+        P, agreeing, done = self._with(chosen, P, self.outlook.agreeing.copy())
         left_out, rows, owners = set[int](), list[Rows](), list[Ints]()
         for k, choice in enumerate(done):
             named = choice.asked[self.views.label[choice.asked] < count]
@@ -339,15 +341,17 @@ class _Planner:
             now += worth
         return result
 
-    def _with(self, chosen: Sequence[_Choice], P: Floats) -> tuple[Floats, Floats, float]:
-        """The joint covariance with some stops made, in that order, who agrees then, and the losses' sum."""
-        agreeing, done = self.outlook.agreeing, list[_Choice]()
+    def _with(
+        self, chosen: Sequence[_Choice], P: Floats, agreeing: Floats, made: Sequence[_Choice] = ()
+    ) -> tuple[Floats, Floats, list[_Choice]]:
+        """The joint covariance, who agrees and all stops with their entries when some are made after those of P."""
+        done = list(made)
         for choice in chosen:
             P, entry = self.belief.with_stop(P)
             done.append(replace(choice, entry=entry, link=self._link(choice.place, done, entry)))
             P = self.belief.take(P, self._rows(done[-1]))
             agreeing = self._agreeing_with(agreeing, choice.asked)
-        return P, agreeing, self._total(P, agreeing)
+        return P, agreeing, done
 
     def _is_near(self, place: int, chosen: Sequence[_Choice]) -> bool:
         """Whether a place is too near to where a stop is planned, or was the last one made."""
@@ -382,17 +386,14 @@ class _Planner:
         # what the whole survey knows less well than the stops around do, as these hang on stops elsewhere
         whole = np.array([now.get(label) or 0.0 for label in problem.labels])
         elsewhere = np.maximum(whole**2 - belief.traces(first)[:count], 0.0)
-        P, done = first, list[_Choice]()
+        P, agreeing, done = first, self.outlook.agreeing, list[_Choice]()
         for choice in at:
-            P, entry = belief.with_stop(P)
-            done.append(replace(choice, entry=entry, link=self._link(choice.place, done, entry)))
-            P = belief.take(P, self._rows(done[-1]))
+            P, agreeing, done = self._with([choice], P, agreeing, done)
             sigma = np.sqrt(np.maximum(belief.traces(P)[:count], 0.0) + elsewhere)
             labels = np.unique(self.views.label[choice.asked])
             in_view = np.unique(self.views.label[self.views.at(choice.place)])
             flashes.append(tuple(PlannedFlash(problem.labels[i], float(sigma[i])) for i in labels if i < count))
             skipped.append(tuple(problem.labels[i] for i in np.setdiff1d(in_view, labels) if i < count))
-        _, agreeing, _ = self._with(at, first)
         stops = tuple(
             PlannedStop(
                 None if np.isnan(way.along[choice.place]) else float(way.along[choice.place]),
@@ -442,7 +443,7 @@ class _Planner:
         elif is_done:
             notes.append(f"every label is known to {1e3 * settings.target_m:.0f} mm then")
         else:
-            notes.append(f"no other stop would lower the labels' uncertainty by {100 * settings.least:.0f} %")
+            notes.append(f"no other stop would lower the labels' uncertainty by {100 * settings.least:g} %")
         if self.way.here is None:
             notes.append("the stops are for a new leg, from the line's beginning")
         return (*self.notes, *notes)
