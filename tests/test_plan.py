@@ -14,7 +14,8 @@ from robotd.plan_records import Plan, PlannedFlash, PlannedLabel, PlannedStop
 from robotd.records import Pose
 from robotd.solver.belief import Belief
 from robotd.solver.covariance import covariance
-from robotd.solver.mapping import solve
+from robotd.solver.mapping import solve, to_map
+from robotd.solver.outlook import Outlook
 from robotd.solver.planning import PlanSettings, plan
 from robotd.solver.problem import build_problem
 from robotd.solver.robust import optimise
@@ -122,6 +123,42 @@ def test_taking_a_flash_back_leaves_what_is_known_without_it(course, begun):
         np.testing.assert_allclose(belief.traces(told.known()), known, rtol=1e-4, atol=1e-9)
 
 
+def chances(course, survey, index):
+    """How likely each label is said to show at one of a course's stops, which is ahead."""
+    problem = build_problem(survey)
+    optimum = optimise(problem)
+    poses = problem.stop_entries(optimum.state)[:, :3]
+    way = along_line(course.line, poses, poses[0], False, 1.0)
+    outlook = Outlook(optimum, to_map(problem, optimum), way)
+    rows = outlook.views.at(int(np.abs(way.along - course.along[index]).argmin()))
+    rows = rows[outlook.views.label[rows] < len(problem.labels)]
+    result = np.zeros(len(problem.labels))
+    np.maximum.at(result, outlook.views.label[rows], outlook.chance[rows])
+    return dict(zip(problem.labels, result.tolist(), strict=True))
+
+
+def seen_at(course, index):
+    return {s.label for s in course.survey.stops[index].sightings}
+
+
+def test_labels_that_stops_did_not_ask_are_not_held_for_hidden(course):
+    *made, following = course.fixed[:5]
+    asked = [None, *(set(sorted(seen_at(course, index))[::2]) for index in made[1:])]
+    shown = seen_at(course, following)
+    whole, part = (chances(course, course.at(made, names), following) for names in ([None] * 4, asked))
+    assert min(whole[label] for label in shown) > 0.75  # it sees all labels: none of them is turned away yet
+    assert min(part[label] for label in shown) > 0.5
+
+
+def test_labels_that_stops_asked_in_vain_are_held_for_hidden():
+    warehouse = drive("warehouse", 0, every=EVERY)
+    *made, following = warehouse.fixed[:9]
+    shown = seen_at(warehouse, following)
+    found = chances(warehouse, warehouse.at(made, [None] * 8), following)
+    hidden = [chance for label, chance in found.items() if label not in shown]
+    assert np.mean(hidden) < 0.5 * np.mean([chance for label, chance in found.items() if label in shown])
+
+
 def test_what_two_rooms_hang_on_is_seen_from_more_than_one_stop():
     # labels of both rooms show at once on 1.2 m of the line only
     warehouse = drive("warehouse", 100, every=EVERY)
@@ -155,6 +192,7 @@ def test_of_a_large_survey_only_the_next_metres_are_planned_and_no_label_is_told
     line = se2_compose(se2_inverse(store.poses[0]), store.poses)[:, :2]
     study = plan(survey, line, settings=PlanSettings(most_stops=2))
     assert "metres are planned" in study.plan.notes[0]
+    assert len(plan(survey, line, settings=PlanSettings(most_stops=1)).plan.stops) == 1
     seen = {s.label for stop in survey.stops for s in stop.sightings}
     placed = {label.label for label in study.map.labels if label.status == "placed"}
     assert placed <= {label.label for label in study.plan.labels} <= seen
