@@ -20,12 +20,11 @@ from .components import beacons_left, moves_left
 from .covariance import frame_covariance
 from .mapping import to_map
 from .panes import outside
-from .placement import segments
-from .problem import BEACON, CAMERA, ROOF, STOP, Ints, Problem, anchors, build_problem
+from .placement import LABELS_TO_JOIN, segments
+from .problem import BEACON, CAMERA, ROOF, STOP, Ints, Problem, anchors, build_problem, stops_per_label
 from .robust import Optimum, optimise
 from .ties import unchecked
 
-JOINING = 3  # shared labels that join two parts of a survey, as in placement
 _LEVEL_M = 0.05  # a label is at camera height within this
 _OUTSIDE_M = 0.5
 _FREE_SCALE = 0.01  # relative standard deviation from which the size of the map counts as free
@@ -158,8 +157,7 @@ def analyse(survey: Survey) -> tuple[Map, Analysis]:
 
 def _before(problem: Problem) -> tuple[str, ...]:
     found = [*_parts(problem), *_frame(problem)]
-    sightings, stops = problem.sightings, problem.stop_count
-    counts = np.bincount(np.unique(sightings.label * stops + sightings.stop) // stops, minlength=len(problem.labels))
+    counts = stops_per_label(problem.sightings.label, problem.sightings.stop, len(problem.labels))
     once = [label for label, count in zip(problem.labels, counts.tolist(), strict=True) if count == 1]
     if once:
         found.append(f"seen from one stop only, so that they may get no position: {_listed(once)}")
@@ -176,7 +174,7 @@ def _parts(problem: Problem) -> list[str]:
     for a in roots.tolist():
         for b in range(a):
             shared = labels[a] & labels[b]
-            enough = len(shared) >= JOINING or len(shared & known) >= 2 or {a, b} <= anchored
+            enough = len(shared) >= LABELS_TO_JOIN or len(shared & known) >= 2 or {a, b} <= anchored
             if enough and roots[a] != roots[b]:
                 roots[roots == roots[a]] = roots[b]
     if len(set(roots.tolist())) == 1:
@@ -186,7 +184,7 @@ def _parts(problem: Problem) -> list[str]:
         stops = [problem.survey.stops[f] for f in np.flatnonzero(roots[part] == root)]
         names.append(_listed([f"{stop.leg}/{stop.stop}" for stop in stops]))
     return [
-        f"the survey falls into {len(names)} parts that share fewer than {JOINING} labels (leg/stop "
+        f"the survey falls into {len(names)} parts that share fewer than {LABELS_TO_JOIN} labels (leg/stop "
         f"{'; '.join(names)}): only the part that fixes the world frame is mapped; map some labels from both"
     ]
 

@@ -9,7 +9,7 @@ import scipy.linalg
 
 from ..records import Floats
 from .bundle import SQUARE, Adjustment
-from .problem import State
+from .problem import STOP, State
 
 _CHECKED = 1e-3  # share of a variance that others check, from which a residual says something
 _MOST_COLUMNS = 6000  # of a dense inverse: 300 MB
@@ -81,7 +81,7 @@ def covariance_reference(adjustment: Adjustment, state: State) -> Covariance:
         coupled[here] = -cross[mine[here], adjustment.point[here, None] - some.start]
     stops = np.zeros((problem.stop_count, 3, 3))
     for f in range(problem.stop_count):
-        entries = columns[5 * f : 5 * f + 3]
+        entries = columns[STOP * f : STOP * f + 3]
         stops[f] = padded[np.ix_(entries, entries)]
     A, B = linear.by_frame, linear.by_point
     crossed = np.einsum("nri,nij,nsj->nrs", A, coupled, B, optimize=True)

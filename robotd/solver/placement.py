@@ -12,7 +12,7 @@ from .initial import chain, locate, triangulate, world_rays
 from .problem import ODOMETRY, STOP, Bools, Ints, Known, Problem, State
 from .wheel_errors import LOST
 
-_LABELS_TO_JOIN = 3  # shared labels that must agree before two runs of odometry are joined
+LABELS_TO_JOIN = 3  # shared labels that must agree before two runs of odometry are joined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +132,7 @@ def _join(problem: Problem, local: Floats, segment: Ints, k: int, axes: dict[int
         return False
     pose, agree = located
     agreeing = np.unique(sightings.label[agree])
-    needed = 2 if np.isin(agreeing, problem.known.label).sum() >= 2 else _LABELS_TO_JOIN
+    needed = 2 if np.isin(agreeing, problem.known.label).sum() >= 2 else LABELS_TO_JOIN
     if len(agreeing) < needed:
         return False
     axes[k] = pose

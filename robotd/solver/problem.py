@@ -14,7 +14,8 @@ fixed: they have no column in the normal equations, so that a planar problem cos
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,21 @@ COVARIANCE_FLOOR = np.diag([1e-4, 1e-4, 1e-4]) ** 2  # keeps a move that was rep
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class Rows:
+    """Arrays of one length, row by row."""
+
+    def select(self, keep: Bools | Ints) -> Self:
+        """Some of the rows."""
+        if keep.dtype == np.bool_:
+            if keep.all():
+                return self
+            keep = np.flatnonzero(keep)  # once, not once a column: large stores have a hundred thousand
+        columns: list[Floats] = [getattr(self, field.name)[keep] for field in fields(self)]
+        return type(self)(*columns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings(Rows):
     """The usable sightings as arrays, ordered by camera; `source` is the index in the survey's own order.
 
     `stop`, `camera`, `label` and `source` are (N,) indices, `uv` (N, 2) px, `sigma` (N,) px, `probability` (N,).
@@ -59,17 +74,9 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.stop)
 
-    def select(self, keep: Bools | Ints) -> Sightings:
-        """Some of the sightings."""
-        if keep.dtype == np.bool_:
-            if keep.all():
-                return self
-            keep = np.flatnonzero(keep)  # once, not once a column: large stores have a hundred thousand
-        return Sightings(*(getattr(self, name)[keep] for name in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moves:
+class Moves(Rows):
     """Odometry factors: `before`, `after` (M,) stops, `measured` (M, 3), `covariance` (M, 3, 3).
 
     `by_errors` (M, 3, 3) are derivatives of the measured by the three last entries of the frame vector. `stated`
@@ -84,13 +91,9 @@ class Moves:
     stated: Floats
     loosened: Bools
 
-    def select(self, keep: Bools) -> Moves:
-        """Some of them."""
-        return Moves(*(getattr(self, name)[keep] for name in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motions:
+class Motions(Rows):
     """Moves by other sensors than wheels: `before`, `after` (K,) stops, `measured` (K, 3), `root` (K, 3, 3), `source`.
 
     The root's product R' R is the information; directions that a sensor does not show have none.
@@ -102,13 +105,9 @@ class Motions:
     root: Floats
     source: NDArray[np.str_]
 
-    def select(self, keep: Bools) -> Motions:
-        """Some of them."""
-        return Motions(*(getattr(self, name)[keep] for name in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Roofs:
+class Roofs(Rows):
     """Beacons seen by roof cameras: `stop` (B,), `beacon` (B, 3) in robot axes, `uv` (B, 2) and `sigma` (B,) in px.
 
     `H_image_world` (B, 3, 3) takes world x, y in the beacons' plane to the roof camera's pixels. `camera` and `which`
@@ -122,10 +121,6 @@ class Roofs:
     uv: Floats
     sigma: Floats
     H_image_world: Floats
-
-    def select(self, keep: Bools) -> Roofs:
-        """Some of the beacon sightings."""
-        return Roofs(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
