@@ -49,10 +49,11 @@ def turned(survey):
         ("room", lambda s: with_pixels(s, lambda x: (x.u + 20.0, x.v)), "centres 20 px aside"),
         ("room", lambda s: with_moves(s, 1.1, 1.1, 1.0), "the moves times 0.9"),
         ("room", lambda s: with_moves(s, 0.3048, 0.3048, 1.0), "the moves times 3.28"),
+        ("warehouse", lambda s: with_moves(s, 3.28084, 3.28084, 1.0), "the moves read as feet"),
         ("room", lambda s: with_moves(s, 1.0, 1.0, -1.0), "turns of the moves counted clockwise"),
         ("room", turned, "the whole rig turned by 270 degrees"),
     ],
-    ids=["smaller", "focal", "cropped", "wheels", "feet", "clockwise", "turned"],
+    ids=["smaller", "focal", "cropped", "wheels", "feet", "long feet", "clockwise", "turned"],
 )
 def test_the_mistake_is_named_and_nothing_is_placed(store, change, said):
     survey, _ = survey_of(store)

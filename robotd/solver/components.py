@@ -70,6 +70,7 @@ class Judged:
         return float(np.clip(np.sqrt(max(variance, 0.0)), 0.0, _WIDEST))
 
 
+_SCALE = "odometry's scale"
 MOVES, KNOWN, BEACONS = "moves", "known labels", "beacons"
 
 
@@ -103,7 +104,12 @@ def widened(problem: Problem, judged: list[tuple[Kind, Judged]]) -> Problem | No
     kind, worst = min(judged, key=lambda pair: (pair[1].likely, -pair[1].square))
     if worst.likely >= _DOUBT or worst.factor <= _SAID:
         return None
-    return _with(problem, kind, worst.factor)
+    wider = _with(problem, kind, worst.factor)
+    for other, tally in judged:
+        # rig and wheels both tell the size: where they contradict each other, neither is believed
+        if other.name == _SCALE and other is not kind and tally.likely < _DOUBT and tally.factor > _SAID:
+            wider = _with(wider, other, tally.factor)
+    return wider
 
 
 def judge(adjustment: Adjustment, state: State, sure: Covariance) -> list[tuple[Kind, Judged]]:
@@ -176,7 +182,7 @@ def _priors(problem: Problem) -> Iterator[Kind]:
     if problem.survey.rig.beacons:
         yield Kind("the beacons' places", np.arange(problem.beacon_entry, last - ODOMETRY))
     for k, name in enumerate(("scale", "turns", "drift")):
-        yield Kind(f"odometry's {name}", np.array([last - ODOMETRY + k]))
+        yield Kind(_SCALE if k == 0 else f"odometry's {name}", np.array([last - ODOMETRY + k]))
 
 
 def _of_whole_rig(problem: Problem) -> Iterator[Kind]:

@@ -241,10 +241,13 @@ def _readings(asked: Problem, seen: Strain) -> Iterator[Reading]:
     """Those that could explain such a strain."""
     survey = asked.survey
     everything = seen.share < FITS or seen.slips or seen.carried > 0 or seen.scatters or seen.strange
+    if asked.frame == "first stop":
+        if seen.share >= _UNSURE:
+            yield from nearly(survey)
+        if seen.share < _UNSURE or seen.chance < IMPOSSIBLE:
+            yield from lengths(survey)
     if seen.scatters:
         yield from lenses(survey)
-    if asked.frame == "first stop":
-        yield from nearly(survey) if seen.share >= _UNSURE else lengths(survey)
     if everything or seen.share < 0.5 * (FITS + _MOSTLY):
         for reading in chain(signs(survey), orders(survey), rigs(survey)):
             if reading.kind != CAMERAS or seen.share < _MOSTLY:  # exchanged cameras leave no survey that fits

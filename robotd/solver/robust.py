@@ -216,7 +216,8 @@ def _instead_of_scatter(optimum: Optimum) -> Optimum:
     """
     factor, slips = scatter(optimum.problem), slipped(optimum.problem)
     scatters = factor > _SCATTERS
-    if not (scatters or slips >= _MANY_SLIPS) or len(optimum.problem.sightings) > MOST_TO_TRY:
+    slip = slips >= _MANY_SLIPS or slips_often(optimum.problem)
+    if not (scatters or slip) or len(optimum.problem.sightings) > MOST_TO_TRY:
         return optimum
     base, prior = optimum.base, optimum.base.prior_sigma
     known, slipping = base.known, base.moves.covariance
