@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from ..errors import InputError, SolverError
 from ..geometry.camera import Camera
@@ -28,6 +28,7 @@ MOST_SIGMAS = 4.0  # of a measured place from where the fit has it
 FARTHEST = 0.6  # m from the robot's origin: no camera is mounted beyond
 LEAST_HELD = 5  # pictures from which a lens can be estimated (Zhang, PAMI 22(11), 2000: 3, without distortion)
 LEAST_TURN = math.radians(15.0)  # between the boards' planes; parallel ones say nothing about the lens
+FIRST_PX, LEAST_PX = 0.3, 0.05  # scatter of corners before it is known, and that no detector goes below
 AHEAD = (0.3, 0.6, 1.0)  # m in front of the robot, where the uncertainty is reported
 
 
@@ -173,51 +174,16 @@ def calibrate_floor(
     start = _start(optics, pictures[anchors[0]], board, places[anchors[0]], names[anchors[0]])
     boards = np.array([_board_place(optics, start, corners, board, places[k]) for k, corners in enumerate(pictures)])
     order = [_ordered(optics, start, corners, board, row) for corners, row in zip(pictures, boards, strict=True)]
-    first = np.concatenate([np.zeros(6), boards.ravel()])
-
-    def pose(values: Floats) -> Floats:
-        T = start.copy()
-        T[:3, :3] = rotation_matrix(values[:3]) @ T[:3, :3]
-        T[:3, 3] += values[3:6]
-        return T
-
-    def fitted(values: Floats) -> list[Floats]:
-        T = invert_rigid(pose(values))
-        rows = values[6:].reshape(-1, 3)
-        return [optics.project(_on_floor(board, row) @ T[:3, :3].T + T[:3, 3])[0] for row in rows]
-
-    def residuals(values: Floats, pixel: float) -> Floats:
-        errors = [(a - b).ravel() / pixel for a, b in zip(fitted(values), order, strict=True)]
-        rows = values[6:].reshape(-1, 3)
-        for k in anchors:
-            place = places[k]
-            assert place is not None
-            turn = math.remainder(rows[k, 2] - place.heading, 2.0 * math.pi)
-            errors.append(
-                np.array(
-                    [
-                        (rows[k, 0] - place.x) / place.sigma_m,
-                        (rows[k, 1] - place.y) / place.sigma_m,
-                        turn / place.sigma_rad,
-                    ]
-                )
-            )
-        return np.nan_to_num(np.concatenate(errors), nan=1e6)
-
-    pixel = 0.3
-    for _ in range(2):  # the second time with the corners' own scatter
-        result = least_squares(residuals, first, x_scale="jac", args=(pixel,), max_nfev=200)
-        first = result.x
-        errors = [a - b for a, b in zip(fitted(first), order, strict=True)]
-        rms = math.sqrt(float(np.mean(np.concatenate(errors) ** 2)))
-        pixel = max(rms, 0.05)
+    fit = _FloorFit(optics, start, board, order, places)
+    result, errors = fit.solve(boards)
+    rms = math.sqrt(float(np.mean(np.concatenate(errors) ** 2)))
     if not rms <= MOST_RMS:
         each = [math.sqrt(float(np.mean(error**2))) for error in errors]
         raise SolverError(
             f"the boards do not fit one flat floor: {rms:.1f} px rms, worst {names[int(np.argmax(each))]} with"
             f" {max(each):.1f} px; leave it out, and check that every board lies flat and --square is its real size"
         )
-    T = pose(result.x)
+    T = fit.pose(result.x)
     _on_robot(T)
     _agree(places, result.x[6:].reshape(-1, 3), names)
     covariance = np.linalg.pinv(result.jac.T @ result.jac)[:6, :6]
@@ -228,7 +194,7 @@ def calibrate_floor(
         camera,
         rms,
         tuple(order),
-        tuple(fitted(result.x)),
+        tuple(fit.fitted(result.x)),
         result.x[6:].reshape(-1, 3),
         math.sqrt(covariance[5, 5]),
         math.sqrt(float(axis_tilt @ covariance[:3, :3] @ axis_tilt)),
@@ -241,6 +207,52 @@ def calibrate_floor(
             " board"
         )
     return calibration
+
+
+class _FloorFit:
+    """What is fitted: turn and shift of the camera from a start (6 values), then x, y, heading of every board.
+
+    `corners` are the pictures', in the order of `Board.corners`; `places` those of the boards that were measured.
+    """
+
+    def __init__(
+        self, optics: Camera, start: Floats, board: Board, corners: Sequence[Floats], places: Sequence[Place | None]
+    ) -> None:
+        self.optics, self.start, self.board = optics, start, board
+        self.corners, self.places = corners, places
+
+    def pose(self, values: Floats) -> Floats:
+        """T_robot_camera (4, 4)."""
+        T = self.start.copy()
+        T[:3, :3] = rotation_matrix(values[:3]) @ T[:3, :3]
+        T[:3, 3] += values[3:6]
+        return T
+
+    def fitted(self, values: Floats) -> list[Floats]:
+        """Pixels (N, 2) of each board's corners."""
+        T = invert_rigid(self.pose(values))
+        rows = values[6:].reshape(-1, 3)
+        return [self.optics.project(_on_floor(self.board, row) @ T[:3, :3].T + T[:3, 3])[0] for row in rows]
+
+    def residuals(self, values: Floats, pixel: float) -> Floats:
+        """Errors of the corners over `pixel`, then of the measured places over their standard deviations."""
+        errors = [(a - b).ravel() / pixel for a, b in zip(self.fitted(values), self.corners, strict=True)]
+        for (x, y, heading), place in zip(values[6:].reshape(-1, 3), self.places, strict=True):
+            if place is not None:
+                turn = math.remainder(heading - place.heading, 2.0 * math.pi)
+                at = (x - place.x) / place.sigma_m, (y - place.y) / place.sigma_m, turn / place.sigma_rad
+                errors.append(np.array(at))
+        return np.nan_to_num(np.concatenate(errors), nan=1e6)
+
+    def solve(self, boards: Floats) -> tuple[OptimizeResult, list[Floats]]:
+        """The optimum from the boards' places (P, 3) on, and its errors in pixels (N, 2), picture by picture."""
+        values, pixel = np.concatenate([np.zeros(6), boards.ravel()]), FIRST_PX
+        for _ in range(2):  # the second time with the corners' own scatter
+            result = least_squares(self.residuals, values, x_scale="jac", args=(pixel,), max_nfev=200)
+            values = result.x
+            errors = [a - b for a, b in zip(self.fitted(values), self.corners, strict=True)]
+            pixel = max(math.sqrt(float(np.mean(np.concatenate(errors) ** 2))), LEAST_PX)
+        return result, errors
 
 
 def _on_floor(board: Board, place: Floats) -> Floats:
