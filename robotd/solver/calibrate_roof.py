@@ -28,6 +28,7 @@ from ..records import CameraModel, Floats, Vector3
 LEVEL = 0.005  # m: points within it count as one height
 FOCALS = (0.45, 0.7, 1.1, 1.8)  # of the image's width: from 96 to 31 degrees across, to start from
 FOCAL_SPREAD = 0.6  # of the logarithm: what is known of a lens that nobody calibrated
+CALIBRATED = (1e-3, 0.3, 0.3)  # of the logarithm, and px of the centre: what calibration leaves of a lens
 CENTRE_SPREAD = 0.02  # of the image's width: how far optical axes miss the middle of the picture
 MOST_SIGMA = 0.05  # m, in the middle of the points: worse than odometry
 MOST_CHI2 = 5.0  # per degree of freedom
@@ -165,6 +166,52 @@ def _undistorted(points: Sequence[RoofPoint], lens: CameraModel) -> Floats:
     return seen
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Resection:
+    """What is fitted: rotation vector from world to camera axes (3), position (3), log of the focal length, centre (2).
+
+    `world` (N, 3) and `sigma` (N,) in metres are the points' places, `seen` (N, 2) and `sigma_px` their pixels,
+    `aspect` is fy over fx. `believed`, `spreads` (3,) are the priors of the last three values, `camera` (x, y, z) and
+    `camera_sigma` that of the position, if it was measured.
+    """
+
+    world: Floats
+    seen: Floats
+    sigma: Floats
+    sigma_px: float
+    aspect: float
+    believed: Floats
+    spreads: Floats
+    camera: Vector3 | None
+    camera_sigma: float
+
+    def project(self, values: Floats) -> tuple[Floats, Floats]:
+        """Pixels (N, 2) and their derivatives (N, 2, 3) by the world points."""
+        R = rotation_matrix(values[:3])
+        local = (self.world - values[3:6]) @ R.T
+        depth = np.where(local[:, 2] > 1e-3, local[:, 2], 1e-3)
+        f = math.exp(values[6]) * np.array([1.0, self.aspect])
+        image = local[:, :2] / depth[:, None]
+        by_local = np.zeros((len(self.world), 2, 3))
+        by_local[:, 0, 0], by_local[:, 1, 1] = f[0] / depth, f[1] / depth
+        by_local[:, :, 2] = -f * image / depth[:, None]
+        return image * f + values[7:9], by_local @ R
+
+    def whitener(self, values: Floats) -> Floats:
+        """(N, 2, 2) that scales pixel errors to unit variance, the measured places' errors included."""
+        _, by_world = self.project(values)
+        places = self.sigma[:, None, None] ** 2 * (by_world @ np.swapaxes(by_world, 1, 2))
+        return np.linalg.inv(np.linalg.cholesky(self.sigma_px**2 * np.eye(2) + places))
+
+    def residuals(self, values: Floats, whiten: Floats) -> Floats:
+        """Whitened errors of the pixels (2 N), then those of the priors."""
+        pixels, _ = self.project(values)
+        parts = [(whiten @ (self.seen - pixels)[:, :, None]).ravel(), (values[6:9] - self.believed) / self.spreads]
+        if self.camera is not None:
+            parts.append((values[3:6] - np.array(self.camera)) / self.camera_sigma)
+        return np.concatenate(parts)
+
+
 def _resect(
     world: Floats,
     seen: Floats,
@@ -181,34 +228,10 @@ def _resect(
     starts = [float(lens.matrix[0])] if lens_known else [share * width for share in FOCALS]
     centre = np.array(lens.matrix[2:]) if lens_known else middle
     aspect = lens.matrix[1] / lens.matrix[0] if lens_known else 1.0
-    spreads = np.array([1e-3, 0.3, 0.3]) if lens_known else np.array([FOCAL_SPREAD, *2 * (CENTRE_SPREAD * width,)])
+    spreads = np.array(CALIBRATED) if lens_known else np.array([FOCAL_SPREAD, *2 * (CENTRE_SPREAD * width,)])
     believed = np.array([math.log(starts[0] if lens_known else 0.8 * width), *centre])
 
-    def project(values: Floats) -> tuple[Floats, Floats]:
-        """Pixels (N, 2) and their derivatives (N, 2, 3) by the world points."""
-        R = rotation_matrix(values[:3])  # from world to camera axes
-        local = (world - values[3:6]) @ R.T
-        depth = np.where(local[:, 2] > 1e-3, local[:, 2], 1e-3)
-        f = math.exp(values[6]) * np.array([1.0, aspect])
-        image = local[:, :2] / depth[:, None]
-        by_local = np.zeros((len(world), 2, 3))
-        by_local[:, 0, 0], by_local[:, 1, 1] = f[0] / depth, f[1] / depth
-        by_local[:, :, 2] = -f * image / depth[:, None]
-        return image * f + values[7:9], by_local @ R
-
-    def whitener(values: Floats) -> Floats:
-        """(N, 2, 2) that scales pixel errors to unit variance, the measured places' errors included."""
-        _, by_world = project(values)
-        spread = sigma_px**2 * np.eye(2) + sigma[:, None, None] ** 2 * (by_world @ np.swapaxes(by_world, 1, 2))
-        return np.linalg.inv(np.linalg.cholesky(spread))
-
-    def residuals(values: Floats, whiten: Floats) -> Floats:
-        pixels, _ = project(values)
-        parts = [(whiten @ (seen - pixels)[:, :, None]).ravel(), (values[6:9] - believed) / spreads]
-        if camera is not None:
-            parts.append((values[3:6] - np.array(camera)) / camera_sigma)
-        return np.concatenate(parts)
-
+    fit = _Resection(world, seen, sigma, sigma_px, aspect, believed, spreads, camera, camera_sigma)
     best = None
     for focal in starts:
         K = np.array([[focal, 0.0, centre[0]], [0.0, aspect * focal, centre[1]], [0.0, 0.0, 1.0]])
@@ -221,15 +244,15 @@ def _resect(
         # at first all pixels weigh the same, because weights that follow a poor start would favour it
         whiten = np.tile(np.eye(2) / sigma_px, (len(world), 1, 1))
         for _ in range(REWEIGHTINGS):
-            result = least_squares(residuals, start, x_scale="jac", max_nfev=200, args=(whiten,))
-            start, whiten = result.x, whitener(result.x)
+            result = least_squares(fit.residuals, start, x_scale="jac", max_nfev=200, args=(whiten,))
+            start, whiten = result.x, fit.whitener(result.x)
         if np.isfinite(result.cost) and (best is None or result.cost < best[0].cost):
             best = result, whiten
     if best is None:
         raise SolverError("no camera sees the points so; are x, y and u, v in the right columns?")
     result, whiten = best
     values = np.asarray(result.x, dtype=np.float64)
-    whitened = residuals(values, whiten)[: 2 * len(world)].reshape(-1, 2)
+    whitened = fit.residuals(values, whiten)[: 2 * len(world)].reshape(-1, 2)
     covariance = np.linalg.pinv(result.jac.T @ result.jac)
     R = rotation_matrix(values[:3])
     pose = np.eye(4)
@@ -238,7 +261,7 @@ def _resect(
     matrix = (focal, focal * aspect, float(values[7]), float(values[8]))
     model = replace(lens, matrix=matrix, T_robot_camera=transform_record(pose))
     freedom = 2 * len(world) - (6 if lens_known else 7)
-    return model, covariance, project(values)[0], whitened, freedom
+    return model, covariance, fit.project(values)[0], whitened, freedom
 
 
 def _of_plane(model: CameraModel, covariance: Floats, height: float) -> Homography:
