@@ -21,7 +21,7 @@ from ..geometry.transforms import se2_relative, wrap_angle
 from ..records import Floats
 from .bundle import SQUARE, Adjustment, Linear
 from .covariance import Covariance, frame_covariance
-from .problem import CAMERA, ODOMETRY, STOP, Bools, Ints, Problem, State
+from .problem import CAMERA, ODOMETRY, SIGMA_FLOOR_PX, STOP, Bools, Ints, Problem, State
 
 MOST_TO_TRY = 5000  # sightings
 _DOUBT = 1e-6  # probability of what is seen below which a stated standard deviation is not believed
@@ -214,6 +214,13 @@ def _with(problem: Problem, kind: Kind, factor: float) -> Problem:
     steady = ~problem.moves.loosened[:, None, None]
     covariance = np.where(steady, problem.moves.covariance * factor**2, problem.moves.covariance)
     return replace(problem, moves=replace(problem.moves, covariance=covariance))
+
+
+def scatter(problem: Problem) -> float:
+    """By how much the sightings' standard deviations were multiplied because they scatter more."""
+    s = problem.sightings
+    stated = np.maximum(problem.columns.sigma[s.source], SIGMA_FLOOR_PX)
+    return float(np.median(s.sigma / stated)) if len(s) else 1.0
 
 
 def rescaled_moves(stated: Problem, state: State, placed: Bools) -> Problem | None:

@@ -17,11 +17,12 @@ import numpy as np
 
 from ..errors import InputError
 from .breaks import carried
+from .components import scatter
 from .known_labels import slipped
 from .problem import CAMERA, ODOMETRY, Problem, build_problem
 from .readings import CAMERAS, LENSES, NEARLY, Reading, lengths, lenses, nearly, orders, rigs, signs
 from .references import IMPOSSIBLE, MOST_TO_TRY, POSSIBLE, chance
-from .robust import Optimum, optimise, scatter
+from .robust import Optimum, optimise
 from .strangers import ALONE, LEAST_LIGHTS, TOGETHER, shares
 
 FITS = 0.5  # share of the survey's sightings below which its calibration or its units are doubted

@@ -16,13 +16,13 @@ from ..geometry.transforms import se2_relative
 from ..records import Floats
 from .breaks import torn_moves, without_moves
 from .bundle import SQUARE, Adjustment, Loss, Solution
-from .components import MOST_TO_TRY, judge, remarks, rescaled_known, rescaled_moves, widened
+from .components import MOST_TO_TRY, judge, remarks, rescaled_known, rescaled_moves, scatter, widened
 from .covariance import Covariance, covariance
 from .hypotheses import Hypotheses, behind_glass, hypotheses, in_floor, out_of_glass, support, with_shared
 from .initial import epipolar_moves
 from .known_labels import contradicted, difference, slipped, slips_often, undecided
 from .placement import Placement, at_first_stop, detach, place, ray_tolerance, retriangulate
-from .problem import SIGMA_FLOOR_PX, STOP, Bools, Problem, State, stops_per_label
+from .problem import STOP, Bools, Problem, State, stops_per_label
 from .references import IMPOSSIBLE, POSSIBLE, agreeing, beacons_disagree, bends, chance
 from .strangers import without_strangers
 from .tie_sightings import without_ties
@@ -489,13 +489,6 @@ def _excess(adjustment: Adjustment, state: State, sure: Covariance) -> float:
     found = float((adjustment.residuals(state, SQUARE).residual ** 2).sum())
     ratio = found / expected
     return float(np.sqrt(ratio)) if ratio > 1.0 + 3.0 * np.sqrt(2.0 / expected) else 1.0
-
-
-def scatter(problem: Problem) -> float:
-    """By how much the sightings' standard deviations were multiplied because they scatter more."""
-    s = problem.sightings
-    stated = np.maximum(problem.columns.sigma[s.source], SIGMA_FLOOR_PX)
-    return float(np.median(s.sigma / stated)) if len(s) else 1.0
 
 
 def _rescaled(problem: Problem, factor: float) -> Problem:
